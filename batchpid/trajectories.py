@@ -118,7 +118,7 @@ def minimum_jerk(
         )
         total = np.broadcast_to(needed.max(-1, keepdims=True), move.shape)
     count = _count(float(total.max()), time_step("dt", dt))
-    time = dt * np.arange(1, count + 1)
+    time = dt * np.arange(1.0, count + 1)
     safe = np.maximum(total, dt)  # a move within one tick is done at its end
     tau = np.minimum(time.reshape(-1, *[1] * move.ndim) / safe, 1.0)
     s = tau**3 * (10 + tau * (6 * tau - 15))

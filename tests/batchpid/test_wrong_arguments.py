@@ -21,7 +21,6 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import LAW_FIELDS
 from batchpid.motors import friction, guard
 from batchpid.motors.actuators import ACTUATOR_FIELDS
-from batchpid.task_space import osc_params
 
 NAMES = ["shoulder", "elbow"]
 
@@ -92,7 +91,6 @@ def test_choices_of_the_law(name):
         refused(name, bp.make_params, 2, 1.0, **{name: value})
 
 
-AXIS = [True] + [False] * 5
 LATE = bp.make_params(2, 1.0, 1.0, gain_units="mass_matrix", discretization="implicit")
 COMBINATIONS = {
     bp.make_params: [
@@ -132,19 +130,16 @@ COMBINATIONS = {
     ts.make_osc_params: [
         {"stiffness": [1.0, 2.0]},
         {"damping_ratio": math.nan},
-        {"damping_ratio": 0.7, "damping": 9.0},
         {"axes": [1, 0, 1, 1, 1, 1]},
-        {"force_axes": AXIS, "axes": [True] * 6},
+        {"axes": [True]},
         {"posture_stiffness": [1.0] * 3},
-        {"effort_min": 1.0, "effort_max": 0.0},
         {"effort_limit": np.ones((2, 2)), "stiffness": np.ones((3, 6))},
         {"position_error_limit": -1.0},
         {"integral_gain": -1.0},
         {"integral_limit": math.nan, "integral_gain": 1.0},
         {"integral_limit": 1.0},
         {"limit_margin": -0.1},
-        {"limit_stiffness": [10.0, 20.0]},
-        *({name: "other"} for name in osc_params.TASK_CHOICES),
+        {"discretization": "other"},
     ],
     bp.step: [
         {
@@ -233,7 +228,7 @@ def test_an_error_names_the_entry_and_its_value(function, changes, places, value
 MODULES = (bp, batchpid.export, ts, motors, friction, guard, metrics, trajectories)
 Y, TREE = np.zeros((1, 2)), planar()
 PARAMS = bp.make_params(2, 4.0, 1.0, 1.0)
-OSC = ts.make_osc_params(TREE, integral_gain=1.0)
+OSC = ts.make_osc_params(TREE, 0.01, integral_gain=1.0)
 POSE = ts.link_poses(TREE, Y, ["tip"])[:, 0]
 MOTORS, GUARD = (
     bp.make_actuators(2, lag=0.1, sensor_delay=0.01, backlash=0.1),
@@ -254,7 +249,7 @@ OWN = {
     "batchpid.task_space": {
         "params": OSC,
         "state": ts.init(OSC, Y),
-        "setpoint": POSE,
+        "inputs": ts.OSCInputs(POSE, Y, Y),
         "dynamics": ts.task_dynamics(TREE, Y, Y, "tip"),
     },
     "batchpid.metrics": {"setpoint": np.ones((9, 1, 2)), "measurement": np.zeros((9, 1, 2))},
@@ -277,7 +272,6 @@ WRONG = {
     "joint_names": [["a"], "ab", ["a", "a"], ["a", 2]],
     "params": [{"kp": 1}],
     "link": ["top", 3],
-    "frame": ["body"],
     "point": [0.1, [0.1], [0.1, 0.2]],
     "qpos": [np.zeros((1, 3)), "here"],
     "qvel": [np.zeros((1, 3))],

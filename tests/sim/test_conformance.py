@@ -193,7 +193,7 @@ FEATURES = {
     "drive with an integral": Feature({"control": "drive"}, EFFORTS, exact=True),
     "efforts": Feature({"control": "effort"}, exact=True),
     "osc": Feature({"control": "osc", "tool": "hand"}),
-    "osc with an integral": Feature(osc(integral_gain=20.0, integral_limit=5.0, frame="tool")),
+    "osc with an integral": Feature(osc(integral_gain=20.0, integral_limit=5.0)),
     "implicit osc": Feature(osc(discretization="implicit", point=[0, 0, 0.1], limit_margin=0.2)),
     "own controller": Feature({"control": Damped()}, exact=True),
     "a command of its own": Feature({"control": Polar()}, exact=True),
