@@ -1,14 +1,13 @@
 """Plan with the simulated robot: a panda reaches around a ball, by rollouts of 64 copies of its
 present state.
 
-    python examples/plan_reach.py [--no-motors] [--delay 0.03] [--film reach.mp4]    (needs SciPy)
+    python examples/plan_reach.py [--no-motors] [--delay 0.03]    (needs SciPy)
 
 Predictive sampling: every 50 ms, 64 splines of setpoints run for 0.3 s, and the robot follows the
 best one. The copies have the delay of the robot's motors; with --no-motors they have ideal ones.
 """
 
 import time
-from pathlib import Path
 
 import numpy as np
 import tyro
@@ -16,8 +15,7 @@ from scipy.interpolate import CubicSpline
 
 import batchpid as bp
 from batchpid import task_space as ts
-from batchpid.sim import Robot, Rollout, Runner, to_urdf
-from batchpid.sim.view.film import write_film
+from batchpid.sim import Robot, Runner
 
 START = np.array([-0.7, 0.3, 0.0, -2.0, 0.0, 2.3, 0.8, 0.02, 0.02])
 GOAL = np.array([0.7, *START[1:]])
@@ -66,24 +64,12 @@ class Planner:
         return setpoints[:, best]
 
 
-def robot_with_ball(robot, path):
-    """Write a robot to ``path`` that has the ball as a visual shape of its base; return it."""
-    place, base = " ".join(map(str, BALL)), robot.tables.bodies[0].name
-    shape = f'<origin xyz="{place}"/><geometry><sphere radius="{RADIUS}"/></geometry>'
-    shape += '<material name="red"><color rgba="0.8 0.2 0.1 1"/></material>'
-    joint = f'<joint name="b" type="fixed"><parent link="{base}"/><child link="ball"/></joint>'
-    ball = f'<link name="ball"><visual>{shape}</visual></link>{joint}</robot>'
-    path.write_text(to_urdf(robot).text.replace("</robot>", ball))
-    return Robot.load(path)
-
-
 def main(
     motors: bool = True,
     delay: float = 0.005,
     samples: int = 64,
     seconds: float = 2.5,
     workers: int | None = None,
-    film: Path | None = None,
 ) -> None:
     """Let the robot reach for some seconds around the ball, and print how near it came to it.
 
@@ -95,7 +81,7 @@ def main(
     actuators = bp.make_actuators(robot.dof, command_delay=delay)
     shared = {"params": params, "engine": "mujoco"}
     own = actuators if motors else None
-    times, parts = [], []
+    times, poses = [], []
     with (
         Runner(robot, samples, actuators=own, workers=workers, **shared) as runner,
         Runner(robot, 1, actuators=actuators, workers=0, **shared) as plant,
@@ -106,14 +92,12 @@ def main(
             began = time.perf_counter()
             setpoints = planner.plan(plant)
             times.append(time.perf_counter() - began)
-            parts.append(plant.rollout(setpoints[:EXECUTED, None]))
-    reach = Rollout.join(parts)
-    least, left = clearance(planner.tree, reach.qpos).min(), np.abs(reach.qpos[-1] - GOAL).max()
+            poses.append(plant.rollout(setpoints[:EXECUTED, None]).qpos)
+    reach = np.concatenate(poses)
+    least, left = clearance(planner.tree, reach).min(), np.abs(reach[-1] - GOAL).max()
     result = "touches the ball" if least < 0 else "goes around"
     print(f"{result}: least distance {1e3 * least:.0f} mm, {left:.2f} rad left at the end")
     print(f"{1 / np.median(times):.1f} plans/s")
-    if film is not None:
-        write_film(reach, film, robot=robot_with_ball(robot, film.with_suffix(".urdf")))
 
 
 if __name__ == "__main__":

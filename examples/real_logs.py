@@ -75,11 +75,8 @@ def servo(robot: Robot, out: Path, seconds: float) -> list[str]:
     params = bp.make_params(1, kp=30.0, effort_limit=12.0, anti_windup="none")
     bp.save_params(out / "servo.yaml", params, robot.joint_names)
     time, qpos, _ = move(robot, "servo", wave(seconds), params)
-    degrees = {"setpoint:hinge": np.degrees(wave(seconds)), "qpos:hinge": np.degrees(qpos)}
-    _write(out / "servo.csv", time_ms=1000 * time, **degrees)
-    units = [f"'{quantity}: {quantity}:{{joint}} deg'" for quantity in ("qpos", "setpoint")]
-    gains = ["--gains", str(out / "servo.yaml")]
-    return [*gains, "--compensate", "none", "--columns", *units]
+    _write(out / "servo.csv", time=time, **{"setpoint:hinge": wave(seconds), "qpos:hinge": qpos})
+    return ["--gains", str(out / "servo.yaml"), "--compensate", "none"]
 
 
 def velocity(robot: Robot, out: Path, seconds: float) -> list[str]:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
-from itertools import pairwise
+from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Document, Float64, Rows
-from batchpid.arrays.trees import digest
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import PIDParams
 from batchpid.motors import Actuators
@@ -46,16 +44,6 @@ RESET, RESTORE, PARAMS, ACTUATORS = 1, 2, 4, 8
 """Bits of :attr:`Rollout.changes`: the envs were reset, a snapshot was restored, params or
 actuators were assigned.
 """
-_CHANGES = {
-    "params": PARAMS | RESTORE,
-    "actuators": ACTUATORS | RESTORE,
-    "draws": RESET | RESTORE,
-    "episodes": RESET | RESTORE,
-    "start": RESET | RESTORE,
-}
-"""Fields of :class:`RunInfo` that may change within a run, and the changes that may do it."""
-_OF_PARTS = ("start", "faults", "rates", "begun", "complete", "description", "urdf")
-"""Fields that differ from part to part of a run."""
 _OF_ROBOT = (
     "joint_names",
     "units",
@@ -307,36 +295,31 @@ class Rollout:
         numbers = np.arange(self.num_envs)[envs]
         return self._mapped(lambda array: array[:, numbers], info=self.info.for_envs(numbers))
 
-    def for_ticks(self, ticks: slice) -> Rollout:
-        """Return the rollout of some ticks."""
-        numbers = np.arange(len(self.time))[ticks]
-        time = self.time[ticks]
-        info = self.info
+    def for_ticks(self, start: int, stop: int | None = None) -> Rollout:
+        """Return the rollout of the ticks from ``start`` to ``stop``, as in a slice.
+
+        Of a later part, the info has the state of envs at its start where the run shows it.
+        """
+        part = slice(start, stop)
+        first, *_ = part.indices(len(self.time))
+        time = self.time[part]
         changes = self.changes
-        if len(numbers):
-            first = numbers[0]
-            faults = tuple([fault for fault in info.faults if fault.time <= time[-1]])
-            info = replace(info, faults=faults)
-            # A later part starts where the ticks before it ended, if nothing was changed there.
-            if first:
-                info = replace(info, start=self.qpos[first - 1])
-            earlier = 0
-            if changes is not None:
-                earlier = np.bitwise_or.reduce(changes[1 : first + 1], axis=None)
-                changes = merged_changes(changes, numbers)
-            unknown: dict[str, Any] = {}
-            for name, bits in _CHANGES.items():
-                if earlier & bits:
-                    unknown[name] = None
-            info = replace(info, **unknown)
-        tick = self.tick * (ticks.step or 1)
-        part = self._mapped(
-            itemgetter(ticks),
-            time=time,
-            tick=tick,
-            info=info,
-        )
-        return replace(part, changes=changes)
+        faults = [fault for fault in self.info.faults if len(time) and fault.time <= time[-1]]
+        info = replace(self.info, faults=tuple(faults))
+        if first:
+            # A later part starts where the ticks before it ended, if no env was placed in between.
+            before = np.zeros(1, np.uint8) if changes is None else changes[1 : first + 1]
+            is_placed = (before[-1:] & (RESET | RESTORE)).any()
+            info = replace(info, start=None if is_placed else self.qpos[first - 1])
+            if before.any():
+                info = replace(
+                    info,
+                    params=None,
+                    actuators=None,
+                    draws=None,
+                    episodes=None,
+                )
+        return self._mapped(itemgetter(part), time=time, info=info)
 
     def _mapped(self, function: Callable[[Rows], Rows], **others: Any) -> Rollout:
         """Return a rollout with ``function`` applied to each array but the times, and with other
@@ -356,34 +339,41 @@ class Rollout:
 
     @staticmethod
     def join(parts: Sequence[Rollout]) -> Rollout:
-        """Return successive rollouts of one run as one, with the info of the first, and the faults
-        of the last, which include the earlier ones. :attr:`changes` has what changed in between.
+        """Return successive rollouts of a runner as one, with the info of the first and the faults
+        of the last, which include the earlier ones.
 
-        Raises
-        ------
-        InvalidArgumentError
-            A part does not go on from the one before it, or has another info.
+        Raises InvalidArgumentError for parts with other joints, envs or ticks, or that do not
+        follow each other.
         """
-        parts = [part for part in parts if len(part.time)] or parts[:1]
-        for number, (before, after) in enumerate(pairwise(parts), start=1):
-            _check_successive(number, before, after)
         first = parts[0]
-        info = replace(
-            first.info,
-            faults=parts[-1].info.faults,
-            rates=any(part.info.rates for part in parts),
-            complete=all(part.info.complete for part in parts),
-        )
+        time = np.concatenate([part.time for part in parts])
+        kinds = {(part.info.joint_names, part.num_envs, part.tick) for part in parts}
+        if len(kinds) > 1 or (np.abs(np.diff(time) - first.tick) > 1e-6 * first.tick).any():
+            problem = "are of other joints, envs or ticks, or do not follow each other"
+            remedy = "join the rollouts of one run, in their order"
+            raise InvalidArgumentError("parts", problem, remedy=remedy)
+        joined: dict[str, Any] = {}
+        for name in OPTIONAL:
+            tables = [getattr(part, name) for part in parts]
+            present = [table for table in tables if table is not None]
+            # A part without feedforward or changes has 0.
+            if present:
+                zero = np.zeros_like(present[0][:1])
+                for number, part in enumerate(parts):
+                    if tables[number] is None:
+                        tables[number] = np.repeat(zero, len(part.time), axis=0)
+                joined[name] = np.concatenate(tables)
         return replace(
             first,
-            time=np.concatenate([part.time for part in parts]),
+            time=time,
             setpoint=np.concatenate([part.setpoint for part in parts]),
             observation=Observation.join([part.observation for part in parts]),
-            info=info,
-            feedforward=_joined(
-                [part.feedforward for part in parts], [part.qpos.shape for part in parts]
+            info=replace(
+                first.info,
+                faults=parts[-1].info.faults,
+                rates=any(part.info.rates for part in parts),
             ),
-            changes=_joined([part.changes for part in parts], [part.ok.shape for part in parts]),
+            **joined,
         )
 
     def __repr__(self) -> str:
@@ -434,50 +424,3 @@ class Rollout:
         from batchpid.sim.plots import step_responses
 
         return step_responses(self, **options)
-
-
-def merged_changes(changes: Rows, ticks: Rows) -> Rows:
-    """Return the changes before each of the ``ticks`` (n,), those before ticks that are left out
-    in between included.
-    """
-    if not len(ticks):
-        return changes[ticks]
-    starts = np.append(ticks[:1], ticks[:-1] + 1)
-    merged: Rows = np.bitwise_or.reduceat(changes[: ticks.max() + 1], starts, axis=0)
-    return merged
-
-
-def _check_successive(number: int, before: Rollout, after: Rollout) -> None:
-    """Raise InvalidArgumentError unless ``after``, part ``number``, goes on from ``before``."""
-    changes = 0 if after.changes is None else np.bitwise_or.reduce(after.changes[0])
-    gap = after.time[0] - after.tick - before.time[-1]
-    differences = []
-    if abs(gap) > 1e-6 * after.tick and not changes & RESTORE:
-        differences.append("time")
-    if (before.tick, before.num_envs) != (after.tick, after.num_envs):
-        differences.append("tick or number of envs")
-    for name in (info_field.name for info_field in fields(RunInfo)):
-        if name in _OF_PARTS or changes & _CHANGES.get(name, 0):
-            continue
-        one = getattr(before.info, name)
-        other = getattr(after.info, name)
-        if one is not other and digest(one) != digest(other):
-            differences.append(name)
-    if differences:
-        problem = f"part {number} does not go on from the one before it: {', '.join(differences)}"
-        remedy = "join all rollouts of one run, in their order"
-        raise InvalidArgumentError("parts", problem, remedy=remedy)
-
-
-def _joined(parts: Sequence[Rows | None], shapes: Sequence[tuple[int, ...]]) -> Rows | None:
-    """Return the arrays of successive parts as one, with 0 for a part without; None if none has
-    one.
-    """
-    present = [part for part in parts if part is not None]
-    if not present:
-        return None
-    tables = [
-        np.zeros(shape, present[0].dtype) if part is None else part
-        for part, shape in zip(parts, shapes, strict=True)
-    ]
-    return np.concatenate(tables)

@@ -72,7 +72,7 @@ def test_each_command_and_program_runs_or_names_its_extra(tmp_path):
         words[1:]
         for page in (README, INDEX)
         for words in shell_lines(page)
-        # The page has no log to identify motors from, which needs an extra for ROS bags alone.
+        # The page has no log to identify motors from.
         if words[0] == "batchpid" and words[1] != "identify"
     ]
     sizes = [[] if "--trajectory" in words else SIZES.get(words[0], []) for words in lines]

@@ -90,14 +90,14 @@ def identify_logs(
     logs: Annotated[
         tuple[Path, ...],
         tyro.conf.Positional,
-        flag("Logs: .csv, ROS bags (.bag, .mcap, folders) or recordings (.h5)."),
+        flag("Logs: .csv files or recordings (.h5)."),
     ] = (),
     gains: Annotated[
         str | None,
         flag(
             "Gains of the PID law that drove the robot: a params file (.yaml or .json), or a name or"
             " file as for --gains of other commands. Without it a recording's own, or the logs'"
-            " efforts. Gains that are found are written beside the actuators, as NAME-gains.yaml.",
+            " efforts.",
             "NAME|FILE",
         ),
     ] = None,
@@ -123,44 +123,12 @@ def identify_logs(
             " always held."
         ),
     ] = False,
-    topic: Annotated[
-        str,
-        flag(
-            "Topic of the measurements in a ROS bag (sensor_msgs/JointState), whose efforts count as"
-            " measured."
-        ),
-    ] = "/joint_states",
-    command_topic: Annotated[
-        str | None,
-        flag(
-            "Topic of the commands in a ROS bag: positions are setpoints, efforts are efforts."
-            " Default: measured efforts."
-        ),
-    ] = None,
-    columns: Annotated[
-        tuple[str, ...],
-        flag(
-            'Columns under other names or in other units, as "QUANTITY: PATTERN UNIT": "time:'
-            ' stamp_ms ms", "qpos: {joint}_pos_deg deg", "effort: -{joint}_tau mNm". Units are deg,'
-            " mrad, mm, mNm, ms, us, ns or a factor; a minus turns the sign.",
-            "PATTERN",
-        ),
-    ] = (),
     no_payload: Annotated[bool, flag("The robot carries no payload.")] = False,
-    payload_link: Annotated[
-        str | None,
-        flag(
-            "Link that carries the payload. Default: the last one with a mass behind the last moving"
-            " link, or the tool, whichever explains the logs better.",
-            "LINK",
-        ),
-    ] = None,
     extras: Annotated[
         tuple[str, ...],
         flag(
             "Further unknowns: load_friction, stribeck, offset, mass (of each link); with --gains"
-            " also gain (a factor of gains that are not known), kd, saturation and slew (the limit"
-            " of the goal's rate)."
+            " also slew (the limit of the goal's rate)."
         ),
     ] = (),
     workers: Annotated[
@@ -180,7 +148,6 @@ def identify_logs(
     ...". The fit simulates a rigid-body model with a Runner's control and motors.
     """
     from batchpid.sim.identification.identification import identify
-    from batchpid.sim.identification.logs import Reading
 
     _use_one_thread()
     # A fit ends when it has converged: the bar shows an upper bound.
@@ -189,9 +156,8 @@ def identify_logs(
         robot,
         logs,
         None if gains is None else _gains(robot, gains),
+        hold=hold,
         payload=not no_payload,
-        payload_link=payload_link,
-        reading=Reading(hold, topic, command_topic, columns),
         compensate=compensate,
         timestep=timestep,
         extras=extras,
@@ -201,9 +167,8 @@ def identify_logs(
     if result.explains or force:
         return result
     print(result.report())
-    problem = "are explained to less than half of the error of the robot as described"
     remedy = "--force writes the file nevertheless"
-    raise InvalidArgumentError("logs", f"{problem}, and no file is written", remedy=remedy)
+    raise InvalidArgumentError("logs", "are not explained, and no file is written", remedy=remedy)
 
 
 def _use_one_thread() -> None:

@@ -259,8 +259,7 @@ class NativeStep:
     """Sim step of ``robots`` with ``dof`` joints as one native call, from Python or from an XLA
     program.
 
-    ``arrays`` and ``fields`` fill a Group of sim_step.h; a joint speed beyond ``speed_limit``
-    (dof,) shows in the status.
+    ``arrays`` and ``fields`` fill a Group of sim_step.h.
     """
 
     def __init__(
@@ -268,12 +267,9 @@ class NativeStep:
         robots: int,
         dof: int,
         arrays: Mapping[str, Rows],
-        speed_limit: Float64 | None,
         **fields: object,
     ) -> None:
         self._arrays = dict(arrays)
-        if speed_limit is not None:
-            self._arrays["speed_limit"] = np.broadcast_to(speed_limit, dof).astype(np.float64)
         addresses = {name: array.ctypes.data for name, array in self._arrays.items()}
         self._native = native.extension("_gateway")
         self._group = structure("Group")(

@@ -342,18 +342,11 @@ class EnginePack(SingleOwner, ABC):
         """
 
     @abstractmethod
-    def compiled_step(
-        self,
-        gravity: bool,
-        coriolis: bool,
-        speed_limit: Float64 | None,
-        drives: bool = False,
-    ) -> NativeStep:
+    def compiled_step(self, gravity: bool, coriolis: bool, drives: bool = False) -> NativeStep:
         """Return the sim step of the present robots.
 
         ``gravity`` and ``coriolis`` select the parts of the passive force that it reads; without
-        both it is zero. The status reports speeds above ``speed_limit`` (dof,), if given. With
-        ``drives`` the targets of the drives may move within a tick.
+        both it is zero. With ``drives`` the targets of the drives may move within a tick.
         """
 
     @abstractmethod

@@ -4,13 +4,12 @@ report.
 
 from batchpid.sim.identification.excitation import excite
 from batchpid.sim.identification.identification import identify
-from batchpid.sim.identification.log import Log, logs_of_rollout
-from batchpid.sim.identification.logs import Reading, read_logs
+from batchpid.sim.identification.log import Log
+from batchpid.sim.identification.log_files import logs_of_rollout, read_logs
 from batchpid.sim.identification.result import draw_motors
 
 __all__ = [
     "Log",
-    "Reading",
     "draw_motors",
     "excite",
     "identify",

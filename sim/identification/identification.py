@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
-from itertools import product
 from multiprocessing import get_context
 from typing import Any, get_args
 
@@ -20,10 +19,9 @@ from batchpid.checks import choice, flag, instance, integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.identification.fit import fit
 from batchpid.sim.identification.log import CommandKind, Log, checked
-from batchpid.sim.identification.logs import Reading, read_logs
+from batchpid.sim.identification.log_files import read_logs
 from batchpid.sim.identification.regression import (
     Guess,
-    better_reading,
     cost_of,
     regress,
     smooth,
@@ -34,7 +32,6 @@ from batchpid.sim.identification.unknowns import (
     BASIC,
     EXTRAS,
     SENDER,
-    UNKNOWN_KINDS,
     Problem,
     Unknowns,
     kinds_of,
@@ -56,8 +53,6 @@ LONGEST_STEP, USUAL_STEP = 2.5e-3, 5e-4
 """Period up to which the rows of a log count as steps of the control, and the longest time step
 otherwise [s].
 """
-SATURATIONS = (0.03, 0.2, 1.0)
-"""Starts of the error at which the law saturates, over the 95 % quantile of the setpoint's error."""
 DETOUR = 0.1
 """Decrease of the regression's cost from which the compensation counts as exact, not through the
 motors.
@@ -71,10 +66,9 @@ def identify(
     *,
     compensate: Compensation | None = None,
     timestep: float | None = None,
+    hold: bool = False,
     payload: bool = True,
-    payload_link: str | None = None,
     extras: Sequence[str] = (),
-    reading: Reading | None = None,
     evaluations: int = 60,
     workers: int = 0,
     progress: Callable[[], object] | None = None,
@@ -84,7 +78,7 @@ def identify(
     Parameters
     ----------
     logs
-        Files (:mod:`batchpid.sim.identification.logs`), or logs from :func:`read_logs`, each with
+        Files (:mod:`batchpid.sim.identification.log_files`), or logs from :func:`read_logs`, each with
         separate settings.
     params
         Params of the PID law that drove the robot, of all its joints or of those in the logs: the
@@ -95,29 +89,27 @@ def identify(
     timestep
         Time step of the control that drove the robot [s]. Default: as the recordings say, else the
         period of the rows up to 2.5 ms, or a part of a longer one of at most 0.5 ms.
+    hold
+        True if the commands of CSV files hold from row to row, False to interpolate between rows.
     payload
-        Find a payload, too.
-    payload_link
-        Link that carries it, at its center of mass. Default: the last link with a mass that is
-        fixed behind the last moving one, or the tool, whichever explains the logs better.
+        Find a payload, too, at the center of mass of the last link with a mass that is fixed behind
+        the last moving one, or of the tool, whichever explains the logs better.
     extras
         Further unknowns: "load_friction", "stribeck" (friction at rest and the speed at which it
-        has fallen), "offset" (of the encoder), "mass" (factors of the links' masses); and of the
-        law, for logs of setpoints, "saturation" (its effort limit), "slew" (the limit of the
-        setpoints' rate), "kd", and "gain", a factor of all gains.
-    reading
-        Units and names in the files.
+        has fallen), "offset" (of the encoder), "mass" (factors of the links' masses); and for logs
+        of setpoints "slew" (the limit of the setpoints' rate).
     evaluations
         Largest number of evaluations of each fit: of all unknowns, and of more or fewer of them.
     workers
         Number of processes, 0 for this one.
     progress
-        Called after each evaluation, and each other reading of a log that is tried.
+        Called after each evaluation.
 
     Raises
     ------
     InvalidArgumentError
-        An option is out of range or contradicts a recording, or a file holds no log of this robot.
+        An option is out of range or contradicts a recording, a file holds no log of this robot, or
+        setpoints were logged late.
     """
     instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")
     kinds = [choice("extras", name, EXTRAS) for name in dict.fromkeys(extras)]
@@ -125,8 +117,8 @@ def identify(
     places: list[str | None] = [None]
     if flag("payload", payload):
         kinds.append("payload")
-        places = _payload_links(robot, payload_link)
-    read = _read(robot, logs, params, reading)
+        places = _payload_links(robot)
+    read = _read(robot, logs, params, hold)
     moves, still = _moving(robot, read)
     robot, data = _prepared(
         robot,
@@ -136,35 +128,24 @@ def identify(
         compensate,
         timestep,
     )
-    law_unknown = bool({"kd", "gain"}.intersection(kinds))
-    progress = progress or (lambda: None)
-    data, guess = _regress(robot, data, law_unknown, progress)
+    data, guess = _regress(data)
     windows = windows_of(data)
     with ExitStack() as stack:
         run = _map(stack, integer("workers", workers, 0, 1000))
         starts = []
-        for place, share in product(places, SATURATIONS if "saturation" in kinds else (0.7,)):
-            unknowns = _unknowns(
-                robot,
-                data,
-                guess,
-                kinds,
-                place,
-                share,
-            )
+        for place in places:
+            unknowns = _unknowns(robot, data, guess, kinds, place)
             starts.append(Problem(data, windows, unknowns, run))
-        solution = fit(starts, evaluations, progress)
+        solution = fit(starts, evaluations, progress or (lambda: None))
     # Worker processes end with the fit.
     return Identification(solution._replace(problem=replace(solution.problem, run=map)), still)
 
 
-def _payload_links(robot: Robot, name: str | None) -> list[str | None]:
-    """Return the links where a payload may be: the one with a ``name``, or the last link with a
-    mass on the body of the tool, and the tool.
+def _payload_links(robot: Robot) -> list[str | None]:
+    """Return the links where a payload may be: the last link with a mass on the body of the tool,
+    and the tool.
     """
     tree = link_tree(robot)
-    if name is not None:
-        return [choice("payload_link", name, tree.links)]
     body = tree.link_bodies[tree.index(tree.tool)]
     links = zip(tree.links, tree.link_bodies, tree.mass, strict=True)
     fixed = [link for link, of_body, mass in links if of_body == body and mass > 0]
@@ -175,7 +156,7 @@ def _read(
     robot: Robot,
     logs: Iterable[Any],
     params: bp.PIDParams | None,
-    reading: Reading | None,
+    hold: bool,
 ) -> list[Log]:
     """Return the logs of the arguments of :func:`identify`."""
     kind: CommandKind | None = None
@@ -187,7 +168,7 @@ def _read(
         if isinstance(source, Log):
             read += checked(source.robot or robot, source)
         else:
-            read += read_logs(robot, [source], kind, reading=reading)
+            read += read_logs(robot, [source], kind, hold=hold)
     if all(log.held_out for log in read):
         raise InvalidArgumentError("logs", "are missing or held out", remedy="name some to fit")
     first = read[0]
@@ -327,17 +308,11 @@ def _law(robot: Robot, log: Log, params: bp.PIDParams | None) -> bp.PIDParams | 
     return laws[-1] if laws else None
 
 
-def _regress(
-    robot: Robot,
-    data: list[LogData],
-    law_unknown: bool,
-    progress: Callable[[], object],
-) -> tuple[list[LogData], Guess]:
+def _regress(data: list[LogData]) -> tuple[list[LogData], Guess]:
     """Return the logs, marked whether the compensation passes through the motors, and the guess of
     the regression.
 
-    Setpoints may seem late where gains are unknown. Raises InvalidArgumentError where a log makes
-    far more sense in another reading.
+    Raises InvalidArgumentError where setpoints acted before they were logged.
     """
     guess = regress(_fitted(data))
     if data[0].drive.gravity:
@@ -351,11 +326,10 @@ def _regress(
         if cost_of(other) < cost_of(guess) - DETOUR:
             data = exact
             guess = other
-    words = better_reading(robot, _fitted(data)[0], guess, progress)
-    if words and not (law_unknown and words.endswith("late")):
-        remedy = "correct the log, or name its columns with sign and unit, as in"
-        remedy += """ --columns "effort: -effort:{joint} mNm\""""
-        raise InvalidArgumentError("logs", f"make sense with {words}", remedy=remedy)
+    delay = round(1e3 * float(guess["setpoint_delay"][0]))
+    if delay < 0:
+        problem = f"have setpoints that were logged about {-delay} ms late"
+        raise InvalidArgumentError("logs", problem, remedy="correct their times")
     return data, guess
 
 
@@ -370,11 +344,8 @@ def _unknowns(
     guess: Guess,
     extras: Sequence[str],
     payload_link: str | None,
-    share: float,
 ) -> Unknowns:
-    """Return the unknowns with starts from the regression, and typical sizes from the motion; the
-    law's limit starts at a ``share`` of the setpoint's error.
-    """
+    """Return the unknowns with starts from the regression, and typical sizes from the motion."""
     data = _fitted(data)
     log, _, plant, drive = data[0]
     starts = dict(guess)
@@ -384,8 +355,8 @@ def _unknowns(
         starts["setpoint_lag"] = np.zeros(1)
     for name in extras:
         kinds += kinds_of(name)
-        if UNKNOWN_KINDS[kinds[-1]].target == "law" and drive.mode == "effort":
-            problem = "is of a law, and the logs hold efforts"
+        if name == "slew" and drive.mode == "effort":
+            problem = "is of setpoints, and the logs hold efforts"
             remedy = "leave it out, or give the params of the law"
             raise InvalidArgumentError("extras", problem, value=name, remedy=remedy)
     if log.measured:
@@ -393,9 +364,6 @@ def _unknowns(
         kinds.remove("delay")
         kinds[kinds.index("strength")] = "effort_scale"
         starts["effort_scale"] = starts["strength"]
-    if "gain" in extras:
-        kinds.remove("strength")
-        starts["gain"] = starts["strength"]
     motion = Motion(*map(np.concatenate, zip(*(part.motion for part in data), strict=True)))
     # The mean inertia of the links, on 200 poses of the motion.
     poses = plant.spread(motion.qpos[:: 1 + len(motion.qpos) // 200])
@@ -411,7 +379,6 @@ def _unknowns(
         "friction": 0.3 * np.maximum(friction, 0.05 * effort),
         "speed": 0.1 * speed,
         "top_speed": np.quantile(np.abs(motion.qvel), 0.99, axis=0),
-        "error": share * np.quantile(np.abs(motion.command - motion.qpos), 0.95, axis=0),
     }
     unknowns = Unknowns(
         robot,

@@ -1,4 +1,4 @@
-"""Log of a robot in motion, the checks that every log passes once, and logs of a rollout.
+"""Log of a robot in motion, and the checks that every log passes once.
 
 A log is divided where its times have a gap, because the commands within it are unknown. Positions
 and setpoints of revolute joints that were logged modulo 2 pi become continuous.
@@ -17,9 +17,7 @@ import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.arrays.elementwise import TURN
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.recording.setpoint_files import error
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.rollout import ACTUATORS, PARAMS, RESET, RESTORE, Rollout
 
 CommandKind = Literal["setpoint", "effort"]
 LIMIT_MARGINS = 0.3, 0.05
@@ -144,10 +142,9 @@ def checked(robot: Robot, log: Log, resets: Sequence[int] = ()) -> list[Log]:
         return [log]
     log = _in_order(log)
     period = float(np.median(np.diff(log.time))) if len(log.time) > 1 else 0.0
-    units = "time is in seconds, or the column is time_ms, time_us or time_ns"
     if period > LONGEST_PERIOD:
         problem = f"has one row per {period:.3g} s, too few to see friction and delay"
-        raise log.error(problem, f"record at 100 Hz or more; {units}")
+        raise log.error(problem, "record at 100 Hz or more, with the time in seconds")
     gaps = np.flatnonzero(np.diff(log.time) > max(GAP, PERIODS * period)) + 1
     cuts = np.union1d(gaps, resets).astype(int)
     parts = list[Log]()
@@ -160,7 +157,7 @@ def checked(robot: Robot, log: Log, resets: Sequence[int] = ()) -> list[Log]:
             parts.append(_unwrapped(robot, part))
     if not parts:
         problem = f"has {len(log.time)} rows in {len(short)} stretches, all too short"
-        remedy = f"record {MIN_ROWS} rows and {MIN_SECONDS} s without a gap; {units}"
+        remedy = f"record {MIN_ROWS} rows and {MIN_SECONDS} s without a gap, the time in seconds"
         raise log.error(problem, remedy)
     if short:
         remark = f"stretches between gaps in time or resets are too short, left out: {short[0]} ..."
@@ -227,8 +224,7 @@ def _unwrapped(robot: Robot, log: Log) -> Log:
         problem = (
             f"{log.place(row)}, column 'qpos:{names[column]}' is far beyond the joint's limits"
         )
-        remedy = 'positions are in rad or m; degrees need --columns "qpos: qpos:{joint} deg"'
-        remedy += "; a joint that turns freely is of type continuous"
+        remedy = "give positions in rad or m; a joint that turns freely is of type continuous"
         between = f"{low[column]:g} to {high[column]:g}"
         raise log.error(f"{problem}, {between}", remedy, log.qpos[row, column])
     qpos = log.qpos.copy()
@@ -243,66 +239,3 @@ def _unwrapped(robot: Robot, log: Log) -> Log:
         command=command,
         is_checked=True,
     )
-
-
-def logs_of_rollout(
-    robot: Robot,
-    rollout: Rollout,
-    kind: CommandKind | None = None,
-    source: str = "rollout",
-) -> list[Log]:
-    """Return a log for each env of ``rollout`` and each stretch between its resets. Setpoints are
-    efforts under control "effort".
-
-    Raises InvalidArgumentError if the simulation of a fit lacks an effect of the run.
-    """
-    info = rollout.info
-    recorded: CommandKind = "effort" if info.control == "effort" else "setpoint"
-    follows = recorded == "setpoint"
-    lengths = np.abs(np.diff(rollout.time) - rollout.tick)
-    # Changes before the first row are before the log.
-    within = np.zeros((0, rollout.num_envs), np.uint8)
-    if rollout.changes is not None:
-        within = rollout.changes[1:]
-    obstacles = {
-        f"is of the joints {', '.join(info.joint_names)}": info.joint_names != robot.joint_names,
-        "was made with a plan": info.plan is not None,
-        "was made with setpoints that are not of joints": info.own_command is not None,
-        f"was made under control {info.control!r}": info.control not in (None, "pid", "effort"),
-        f"holds {recorded}s": kind not in (None, recorded),
-        "was made with setpoint rates": info.rates and follows,
-        "was made with a feedforward": rollout.feedforward is not None,
-        "has setpoints that a guard changed": np.any(rollout.guarded),
-        "was made with a randomization": info.randomization,
-        "has params that were changed": (within & PARAMS).any() and follows,
-        "has actuators that were changed": (within & ACTUATORS).any(),
-        "has a snapshot that was restored": (within & RESTORE).any(),
-        "has ticks of varied length": (lengths > 1e-9 + 1e-6 * rollout.tick).any(),
-        "has failed": not rollout.ok.all(),
-    }
-    for problem, holds in obstacles.items():
-        if holds:
-            remedy = "record another run under control pid or effort"
-            raise error(source, f"{problem}, which a fit cannot use", remedy)
-    joints = np.flatnonzero(robot.independent)
-    logs = []
-    for env in range(rollout.num_envs):
-        params = None
-        if info.params is not None and follows:
-            params = info.params.for_envs(slice(env, env + 1))
-        log = Log(
-            source if rollout.num_envs == 1 else f"{source}, env {env}",
-            tuple(joints.tolist()),
-            recorded,
-            rollout.time,
-            rollout.qpos[:, env, joints].astype(float),
-            rollout.time - rollout.tick,
-            np.asarray(rollout.setpoint)[:, env, joints].astype(float),
-            held=True,
-            timestep=info.timestep,
-            compensate=info.compensate,
-            params=params,
-        )
-        resets = np.flatnonzero(within[:, env] & RESET) + 1
-        logs += checked(robot, log, resets.tolist())
-    return logs

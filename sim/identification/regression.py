@@ -14,20 +14,17 @@ and the filtered positions. The delays with the least residual are taken from a 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
-from itertools import combinations
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 import batchpid as bp
-from batchpid.arrays.array_types import Bool, Float64
+from batchpid.arrays.array_types import Float64
 from batchpid.arrays.elementwise import wrap
 from batchpid.motors.friction import compensation
 from batchpid.sim.identification.log import Log, interpolated
 from batchpid.sim.identification.simulator import LogData, Motion
-from batchpid.sim.robot.robot import Robot
 from batchpid.task_space.tree_quantities import inverse_dynamics
 
 VALUES = "armature", "damping", "friction", "strength", "bias", "cost"
@@ -46,24 +43,14 @@ LONGEST_PART = 30.0
 """Length of a log that is used [s]."""
 MOST_REGRESSION_ROWS = 4000
 """Most rows of a regression."""
-STRENGTHS = 0.2, 3.0
-"""Strengths beyond which a log is suspected to mean something else."""
 MOVES = 0.4
 """Speed, over its root mean square, below which a joint may stick."""
 WEIGHT = 0.02
 """Weight of the prior at strength 1, over the effort's size."""
-OTHER_UNIT_RATIO = 3.0
-"""Effort over the robot's limit from which it looks like another unit."""
-EVIDENCE = 0.7
-"""Least decrease of the cost for another reading of a log to be reported."""
-WORST = -1.0
-"""Largest cost of a reading that is reported."""
 ALIKE_COSTS = 1.4
 """Difference of costs below which two explanations count as equally good: a factor of 2 in the
 residuals.
 """
-TRIED_SECONDS = 10.0
-"""Other readings are tried on this first part of a log [s]."""
 LEAST_SHARE = 0.05
 """Share of a joint's effort that moves the links, below which its strength is not identifiable: the
 motor's inertia and friction take the rest, which determines their ratios to the strength only.
@@ -278,68 +265,3 @@ def bounded_solution(
             break
         free[np.argmax(np.abs(push) * inward)] = True
     return x
-
-
-def better_reading(
-    robot: Robot,
-    data: LogData,
-    guess: Guess,
-    progress: Callable[[], object],
-) -> str:
-    """Return the reading of a log that explains its efforts far better than the present one, in
-    words; "" for none.
-
-    Signs, exchanged joints and units are tried if the ``guess`` is odd or efforts are far above the
-    robot's limits.
-    """
-    log = data.log
-    strength = guess["strength"]
-    # The motor explains little of the efforts, or its strength is far from 1.
-    odd = (guess["cost"] > WORST) | (strength < STRENGTHS[0]) | (strength > STRENGTHS[1])
-    limits = robot.effort_limit[list(log.joints)]
-    beyond = np.quantile(np.abs(log.command), 0.99, axis=0) > OTHER_UNIT_RATIO * limits
-    if odd.any() or (log.kind == "effort" and (beyond & (limits > 0)).any()):
-        begin = log.part(
-            log.time < log.time[0] + TRIED_SECONDS, log.command_time < log.time[0] + TRIED_SECONDS
-        )
-        names = [robot.joint_names[joint] for joint in log.joints]
-        costs = dict[str, float]()
-        for words, on_qpos, on_command in _readings(log.kind, names, odd):
-            progress()
-            other = replace(begin, qpos=begin.qpos @ on_qpos, command=begin.command @ on_command)
-            motion = smooth(other, data.drive.timestep)
-            costs[words] = cost_of(regress([data._replace(log=other, motion=motion)]))
-        present = costs.pop("")
-        best = min(costs.values())
-        if best < min(present - EVIDENCE, WORST):
-            return next(words for words, cost in costs.items() if cost < best + ALIKE_COSTS)
-    delay = float(guess["setpoint_delay"][0])
-    if delay < -1e-9:
-        return f"setpoints that were logged about {-1e3 * delay:.0f} ms late"
-    return ""
-
-
-def _readings(kind: str, names: Sequence[str], odd: Bool) -> Iterator[tuple[str, Float64, Float64]]:
-    """Yield the present reading (""), and others of the ``odd`` joints: words, and the matrices
-    (joints, joints) that correct rows of positions and of commands.
-    """
-    same = np.eye(len(names))
-    yield "", same, same
-    changes = dict[str, Float64]()
-    for joint in np.flatnonzero(odd).tolist():
-        changes[f"of {names[joint]} with the other sign"] = same - 2 * np.diag(same[joint])
-    for first, second in combinations(range(len(names)), 2):
-        # One of two exchanged joints may look as usual.
-        if odd[first] or odd[second]:
-            order = np.arange(len(names))
-            order[[first, second]] = second, first
-            changes[f"of {names[first]} and {names[second]} exchanged"] = same[order]
-    for words, matrix in changes.items():
-        yield f"{kind} {words}", same, matrix
-        yield f"qpos {words}", matrix, same
-        yield f"qpos and {kind} {words}", matrix, matrix
-    yield f"{kind} of all joints with the other sign", same, -same
-    if kind == "effort":
-        yield "effort in thousandths of SI units", same, 1e-3 * same
-    else:
-        yield "setpoints in degrees", same, np.radians(same)

@@ -8,7 +8,6 @@ import os
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import compress
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -19,7 +18,6 @@ from batchpid.checks import integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
 from batchpid.sim.identification.fit import INTERVAL, Fit
-from batchpid.sim.identification.simulator import changed_params
 from batchpid.sim.identification.unknowns import (
     UNKNOWN_KINDS,
     Problem,
@@ -29,7 +27,6 @@ from batchpid.sim.identification.unknowns import (
 )
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import load_robot_actuators
-from batchpid.sim.robot.urdf_export import to_urdf
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,8 +37,10 @@ KEY = "confidence_region"
 """Key of an actuators file, under "about"."""
 AT_BOUND = 1e-6
 """Distance from a bound, over the typical size, at which a value is there."""
-EXPLAINS = 0.5
-"""Share of the position error of the robot as described that a file may leave."""
+EXPLAINS, EXPLAINS_MOTION = 0.5, 0.25
+"""Shares that a file may leave: of the position error of the robot as described, and of that of a
+robot that does not move.
+"""
 
 
 class Estimate(NamedTuple):
@@ -115,9 +114,14 @@ class Identification:
 
     @property
     def explains(self) -> bool:
-        """True if less than half of the error of the robot as described is left."""
+        """True if less than half is left of the error of the robot as described, and a quarter of
+        that of a robot that does not move.
+        """
         before, after = self.held_out_error
-        return after < EXPLAINS * before
+        judged = self.fit.problem.judged
+        moved = np.concatenate([(window.measured - window.qpos)[rows] for window, rows in judged])
+        motion = float(np.sqrt((moved**2).mean()))
+        return after < min(EXPLAINS * before, EXPLAINS_MOTION * motion)
 
     @property
     def remarks(self) -> list[str]:
@@ -142,6 +146,9 @@ class Identification:
             remarks.append(f"{words} delay is {half:.2g} s shorter")
         if self.fit.dropped:
             remarks.append(f"not needed by these logs: {', '.join(self.fit.dropped)}")
+        if not self.explains:
+            words = "check signs, units and order of the columns"
+            remarks.append(f"the motion is not explained: {words}")
         if not self.fit.converged:
             remarks.append("the fit has not converged: the values are the best so far")
         return remarks
@@ -216,7 +223,7 @@ class Identification:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write :meth:`actuators` to a .yaml or .json file, with estimates, errors and the
-        confidence region; and :meth:`gains`, if the law was identified, to NAME-gains.yaml.
+        confidence region.
         """
         region = {
             "unknowns": [[entry.kind, self._place(entry)] for entry in self.unknowns.entries],
@@ -225,10 +232,6 @@ class Identification:
         }
         about = self.document() | {KEY: region}
         bp.save_actuators(path, self.actuators(), self.unknowns.robot.joint_names, about)
-        gains = self.gains()
-        if gains is not None:
-            beside = Path(path).with_name(f"{Path(path).stem}-gains.yaml")
-            bp.save_params(beside, gains, self.joint_names)
 
     def document(self) -> Document:
         """Return the result as plain values: :attr:`estimates`, errors and remarks."""
@@ -241,31 +244,6 @@ class Identification:
             "remarks": self.remarks,
             "identified_from": [part.log.source for part in self.fit.problem.data],
         }
-
-    def corrected_urdf(self) -> str:
-        """Return the URDF of the robot with the identified masses; the links of a body keep their
-        shares of its mass.
-
-        Raises
-        ------
-        InvalidArgumentError
-            Masses are not among the unknowns (extras=["mass"]).
-        """
-        pairs = zip(self.unknowns.entries, self.values.tolist(), strict=True)
-        factors = {str(entry.place): value for entry, value in pairs if entry.kind == "mass"}
-        if not factors:
-            remedy = "identify with extras=['mass']"
-            raise InvalidArgumentError("corrected_urdf", "no mass was found", remedy=remedy)
-        return to_urdf(self.unknowns.robot, mass_factors=factors).text
-
-    def gains(self) -> bp.PIDParams | None:
-        """Return the params of the identified law, of the logged joints; None unless "gain", "kd" or
-        "saturation" was an unknown.
-        """
-        law = self.unknowns.tables(self.values[None], "law")
-        if law.keys() <= {"slew"}:
-            return None
-        return changed_params(self.fit.problem.data[0].drive.params, law)
 
     def figure(self) -> Figure:
         """Return a picture of the position errors along the first log, before and after."""

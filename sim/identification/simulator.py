@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-import batchpid as bp
 from batchpid.arrays.array_types import Array, Float64
 from batchpid.arrays.trees import mapped
 from batchpid.motors.actuators import JOINT_SIDE, Actuators
@@ -54,14 +53,12 @@ OF_JOINTS = ("powered", "modelled", "band", "turns")
 
 
 class Candidates(NamedTuple):
-    """Motors, laws and robots of n simulations."""
+    """Motors, setpoints and robots of n simulations."""
 
     actuators: Actuators
     """(n, joints), in addition to friction and damping of the description."""
-    law: Mapping[str, Float64]
-    """Changes (n, joints) of the law: factors "gain" and "kd", "saturation" (effort limit over kp)
-    and "slew" (limit of the setpoints' rate).
-    """
+    slew: Any
+    """Limits of the setpoints' rate (n, joints), or None."""
     setpoint_delay: Float64
     """Delay of the setpoints (n,) [s]."""
     setpoint_lag: Float64
@@ -201,13 +198,12 @@ class LogPlant:
         if candidates.setpoint_lag.any():
             share = np.repeat(dt / (dt + candidates.setpoint_lag[:, None]), tree.dof, axis=1)
             further = (*further, Lag(share))
-        slew = candidates.law.get("slew")
         control = drive._replace(
             envs=envs,
             coupling=coupling,
-            params=mapped(self.spread, changed_params(drive.params, candidates.law)),
+            params=mapped(self.spread, drive.params),
             actuators=actuators,
-            guard=None if slew is None else Guard(rate=self.spread(slew)),
+            guard=None if candidates.slew is None else Guard(rate=self.spread(candidates.slew)),
             friction=added_friction(described, actuators),
             further=further,
             **{name: self.spread(getattr(drive, name)) for name in OF_JOINTS},
@@ -255,20 +251,6 @@ class LogData(NamedTuple):
     motion: Motion
     plant: LogPlant
     drive: Control
-
-
-def changed_params(params: bp.PIDParams, law: Mapping[str, Float64]) -> bp.PIDParams:
-    """Return the params of n candidates."""
-    gain = law.get("gain", 1.0)
-    factors = {"kp": gain, "ki": gain, "kd": gain * law.get("kd", 1.0)}
-    for name, factor in factors.items():
-        table = getattr(params, name)
-        if table is not None:
-            params = params._replace(**{name: table * factor})
-    if "saturation" not in law:
-        return params
-    most = params.kp * law["saturation"]
-    return params._replace(effort_min=-most, effort_max=most)
 
 
 def simulate(

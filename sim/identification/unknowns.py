@@ -43,7 +43,7 @@ RESOLUTION = 1e-5
 class Kind(NamedTuple):
     """Kind of unknown, in SI units."""
 
-    target: Literal["motor", "law", "robot", "sensor", "setpoint"]
+    target: Literal["motor", "robot", "sensor", "setpoint"]
     """Part of a candidate that it changes. Only motors become actuators."""
     per: Literal["joint", "robot", "link"]
     size: str | float
@@ -121,10 +121,7 @@ UNKNOWN_KINDS = {
         field="position_offset",
         least=-np.inf,
     ),
-    "gain": Kind("law", "joint", 1.0, 3.0, 1.0),
-    "kd": Kind("law", "joint", 1.0, 2.0, 1.0),
-    "saturation": Kind("law", "joint", "error", 2.0, np.inf),
-    "slew": Kind("law", "joint", "top_speed", 2.0, np.inf),
+    "slew": Kind("setpoint", "joint", "top_speed", 2.0, np.inf),
     # A body without any mass has no center.
     "mass": Kind(
         "robot",
@@ -136,14 +133,13 @@ UNKNOWN_KINDS = {
     ),
 }
 """Kinds of unknowns. "effort_scale" is the scale of measured efforts, "static" the friction at rest
-in addition to "friction", "stribeck" the speed at which half of it is left. "gain" is a factor of
-all gains of the law, "kd" of kd alone, "saturation" the law's effort limit over its kp [rad or m],
-"slew" the limit of the setpoints' rate, "mass" a factor of a link's mass and inertia. The delay and
-the first-order lag of setpoints belong to their sender.
+in addition to "friction", "stribeck" the speed at which half of it is left. "slew" is the limit of
+the setpoints' rate, "mass" a factor of a link's mass and inertia. The delay and the first-order lag
+of setpoints belong to their sender.
 """
 BASIC = ("armature", "damping", "friction", "strength", "bias", "delay")
 """Kinds that every fit has."""
-EXTRAS = ("load_friction", "stribeck", "offset", "mass", "gain", "kd", "saturation", "slew")
+EXTRAS = ("load_friction", "stribeck", "offset", "mass", "slew")
 """Kinds that a fit has on request; "stribeck" brings "static" with it."""
 SENDER = ("setpoint_delay", "setpoint_lag")
 """Kinds that every fit of setpoints has in addition."""
@@ -301,8 +297,7 @@ class Unknowns:
         for column, entry in enumerate(self.entries):
             if entry.kind in masses:
                 masses[entry.kind][entry.place or self.payload_link] = values[:, column]
-        law = self.tables(values, "law")
-        return Candidates(Actuators(**fields), law, late, lag, **masses)
+        return Candidates(Actuators(**fields), sender.get("slew"), late, lag, **masses)
 
     def only(self, mask: Bool) -> Unknowns:
         """Return the unknowns of a mask (unknowns,); the others have their neutral value."""
@@ -386,6 +381,12 @@ class Problem:
         robots = self.unknowns.candidates(self.unknowns.values(points))
         return plant, drive, robots, states, windows
 
+    @property
+    def judged(self) -> list[tuple[Stretch, Bool]]:
+        """Windows with held-out rows, and the masks of these; all rows if none is held out."""
+        held_out = [(window, ~window.fitted) for window in self.windows if not window.fitted.all()]
+        return held_out or [(window, window.fitted) for window in self.windows]
+
     def fitted(self, point: Float64, changes: Float64 | None = None) -> Float64:
         """Return residuals of the fitted rows, and their derivatives by the unknowns along
         ``changes`` (n, unknowns) of the point: (rows, joints, 1 + unknowns).
@@ -409,10 +410,9 @@ class Problem:
 
         Windows of efforts begin at the logged state, or at the best one if states are free.
         """
-        held_out = [window for window in self.windows if not window.fitted.all()]
-        windows = held_out or self.windows
-        pairs = zip(windows, self.evaluate(windows, point, changes, free_states), strict=True)
-        table = np.concatenate([table[window.fitted ^ bool(held_out)] for window, table in pairs])
+        windows, rows = zip(*self.judged, strict=True)
+        tables = self.evaluate(windows, point, changes, free_states)
+        table = np.concatenate([table[mask] for table, mask in zip(tables, rows, strict=True)])
         table[..., 1:] += table[..., :1]
         size: Float64 = np.sqrt((table**2).mean(0)).T
         return size

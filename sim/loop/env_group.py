@@ -405,8 +405,7 @@ class EnvGroup:
         if returned is not None:
             params = self._executor.setup.control.params
             returned = clip(returned, params.effort_min, params.effort_max, np)
-        limit = self._options.speed_limit
-        self._faults.fail_state(self.pack, step, before, returned, limit)
+        self._faults.fail_state(self.pack, step, before, returned)
         self._place_failed()
 
     def _place_failed(self) -> None:

@@ -7,12 +7,11 @@ depend on options of another group, or on the number of envs.
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Annotated, Any, get_type_hints
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Annotated, Any, Concatenate, ParamSpec, get_type_hints
 
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Kind, PerMassMatrix
@@ -23,16 +22,14 @@ from batchpid.checks import AxisKind, instance
 from batchpid.errors import InvalidArgumentError, RobotError
 from batchpid.law.computed_torque import check_gain_units
 from batchpid.law.state import check_drive
-from batchpid.motors.friction import Friction
 from batchpid.sim.description.tables import MjcfFile
-from batchpid.sim.engine.scene_spec import SceneSpec, added_friction
+from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.options.groups import (
     Controller,
     ControlMode,
     ControlOptions,
     Option,
     Place,
-    Ray,
     SceneOptions,
     WorkerOptions,
     option,
@@ -56,6 +53,7 @@ from batchpid.sim.signals import (
 )
 from batchpid.sim.tool_space import OperationalSpace
 
+P = ParamSpec("P")
 IDEAL = bp.Actuators()
 """Actuators without any effect."""
 OPTION_GROUPS = (SceneOptions, ControlOptions, WorkerOptions)
@@ -66,7 +64,7 @@ OPTION_GROUPS = (SceneOptions, ControlOptions, WorkerOptions)
     eq=False,
     kw_only=True,
 )
-class RunnerKeywords(SceneOptions, ControlOptions, WorkerOptions):
+class RunnerKeywords(WorkerOptions, SceneOptions, ControlOptions):
     """Arguments of a :class:`batchpid.sim.Runner`, as they are passed; all but the first two may be
     left out.
 
@@ -79,6 +77,24 @@ class RunnerKeywords(SceneOptions, ControlOptions, WorkerOptions):
         kw_only=False
     )
     """Number of robots, one in each scene."""
+
+
+def with_arguments_of(
+    record: Callable[P, object],
+) -> Callable[[Callable[..., None]], Callable[Concatenate[Any, P], None]]:
+    """Return a decorator that gives a method the arguments of ``record``, for editors and help."""
+
+    def decorated(method: Callable[..., None]) -> Callable[Concatenate[Any, P], None]:
+        kinds = get_type_hints(record)
+        this = inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)
+        parameters = [
+            parameter.replace(annotation=kinds[parameter.name])
+            for parameter in inspect.signature(record).parameters.values()
+        ]
+        vars(method)["__signature__"] = inspect.Signature([this, *parameters])
+        return method
+
+    return decorated
 
 
 OPTIONS = declared(RunnerKeywords, Option)
@@ -106,9 +122,7 @@ class RunnerOptions(RunnerKeywords):
     ground: bool
     contacts: tuple[str, ...] | None
     wrenches: tuple[str, ...] | None
-    speed_limit: NDArray[np.float64] | None
     guard: bp.Guard | None
-    cluster: Ray | None
     actuators: bp.Actuators | None
 
     def __post_init__(self) -> None:
@@ -202,12 +216,6 @@ class RunnerOptions(RunnerKeywords):
         """Last axis of each array of a command: the kind of its columns, and their names."""
         kind: AxisKind = "joint" if self.own_command is None else "entry"
         return (*[(kind, self.command.names)] * 3, ("joint", self.robot.joint_names))
-
-    def has_stiction(self, actuators: bp.Actuators | None) -> bool:
-        """Return whether joints with ``actuators`` have Coulomb friction that the loop models."""
-        if self.robot.friction.any() or getattr(self.randomization, "friction", None) is not None:
-            return True
-        return added_friction(Friction(), actuators).coulomb is not None
 
     def check_params(self, params: bp.PIDParams) -> bp.PIDParams:
         """Return ``params``, as a read-only copy, if they fit the robot, the number of envs and the

@@ -8,7 +8,7 @@ A file has a header and one row per tick, in SI units, with the columns in any o
 
 A row holds at its time, the end of a tick. A first row at time 0 is the pose in which the robot
 starts. Followers need no column: the values of their leaders determine theirs. Commas, tabs or
-semicolons separate the cells, as in a log (:mod:`batchpid.sim.identification.logs`), which is read
+semicolons separate the cells, as in a log (:mod:`batchpid.sim.identification.log_files`), which is read
 here, too.
 """
 
@@ -329,7 +329,7 @@ def _substeps(
             if len(time) > 1 and period > 0:
                 # Times are rounded: over all rows the period is closer than between two.
                 period = (time[-1] - time[0]) / np.round(np.diff(time) / period).sum()
-            remedy += f", or use --timestep {period / substeps:.9g} (timestep=), or --by-plan"
+            remedy += f", or use --timestep {period / substeps:.9g} (timestep=)"
         raise error(source, problem, remedy)
     if first + len(time) == 1:
         problem = f"line {lines[0]}: the only row is at 0 s"

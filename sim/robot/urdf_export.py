@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from copy import deepcopy
 from pathlib import Path
 
@@ -14,27 +14,21 @@ from lxml import etree
 from batchpid.arrays.array_types import Float64
 from batchpid.errors import RobotError
 from batchpid.export.differences import Exported
-from batchpid.sim.description.merging import link_inertias
 from batchpid.sim.description.reading import is_mjcf, read_robot
-from batchpid.sim.description.tables import NO_TURN, Body
+from batchpid.sim.description.tables import Body
 from batchpid.sim.description.urdf import UNUSED
 from batchpid.sim.description.xml import parse_xml
 from batchpid.sim.findings import summary
 from batchpid.sim.geometry.mesh_files import find_mesh
 from batchpid.sim.geometry.shapes import MOMENTS, Shape, mesh_file
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.robot_model import link_tree
 from batchpid.task_space.frames import to_rpy
 
 COPIED = {*UNUSED, "safety_controller"}
 """Elements that are copied from a URDF."""
 
 
-def to_urdf(
-    robot: Robot,
-    folder: Path | None = None,
-    mass_factors: Mapping[str, float] | None = None,
-) -> Exported:
+def to_urdf(robot: Robot, folder: Path | None = None) -> Exported:
     """Return the URDF of ``robot`` with its repairs, which need none again, and a list of them.
 
     Links, joints, shapes and mimics are written from the tables; visuals, soft limits and elements
@@ -46,9 +40,6 @@ def to_urdf(
         Its file is read again.
     folder
         Of the new file: paths of meshes are relative to it. Default: absolute paths.
-    mass_factors
-        Factors of the masses and inertia tensors of rigid bodies, each by the name of one of its
-        links. The links that fixed joints connect keep their shares.
 
     Raises
     ------
@@ -58,7 +49,7 @@ def to_urdf(
     path, packages = robot.path, robot.source.package_dirs
     if read_robot(path, robot.fixed_base, packages, "skip").tables != robot.tables:
         raise RobotError(f"{path}: has changed since the robot was loaded; load it again")
-    root = _write(robot, mass_factors or {})
+    root = _write(robot)
     differences = [sentence.partition(": ")[2] for sentence in summary(robot.repairs)]
     if not is_mjcf(source := parse_xml(path)):
         _copy_unused(source, root, path, packages)
@@ -74,21 +65,11 @@ def to_urdf(
     return Exported(f'<?xml version="1.0"?>\n{text}\n', tuple(differences))
 
 
-def _write(robot: Robot, mass_factors: Mapping[str, float]) -> etree._Element:
+def _write(robot: Robot) -> etree._Element:
     """Return the ``<robot>`` of the tables."""
     root = etree.Element("robot", name=robot.name)
-    tree = link_tree(robot)
-    inertias = link_inertias(robot.tables)
-    factors = {tree.link_bodies[tree.index(name)]: mass_factors[name] for name in mass_factors}
     for body in robot.tables.bodies:
         link = etree.SubElement(root, "link", name=body.name)
-        factor = factors.get(tree.link_bodies[tree.index(body.name)])
-        # A factor of the rigid body holds for each of its links.
-        if factor is not None and body.name in inertias:
-            # A mass of shapes becomes a number.
-            mass, center, inertia = inertias[body.name]
-            body = body._replace(center=center, inertia_wxyz=NO_TURN)
-            body = body._replace(mass=factor * mass, inertia=factor * inertia)
         if body.mass:
             inertial = _placed(link, "inertial", body.center, body.inertia_wxyz)
             etree.SubElement(inertial, "mass", value=_text([body.mass]))

@@ -9,12 +9,12 @@ editors and readers.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from operator import itemgetter, methodcaller
 from time import strftime
-from typing import TYPE_CHECKING, Any, Literal, Never
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,26 +25,17 @@ from batchpid.checks import check_keywords, choice, instance
 from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError, SingleOwner, warn
 from batchpid.io.files import package_versions
 from batchpid.sim.diagnosis.loop_stability import StabilityCheck
-from batchpid.sim.engine.scene_spec import MujocoSolver, Physics
 from batchpid.sim.findings import report_shortfalls
 from batchpid.sim.loop.arrays import Snapshot
 from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.group_control import describe, native_obstacle
-from batchpid.sim.options.groups import (
-    DEFAULT_ENGINE,
-    Backend,
-    Compensation,
-    Controller,
-    ControlMode,
-    EngineName,
-    FaultAction,
-    InvalidInputAction,
-    PhysicsPreset,
-    Ray,
+from batchpid.sim.options.options import (
+    OPTIONS,
+    RunnerKeywords,
+    RunnerOptions,
+    checked_option,
+    with_arguments_of,
 )
-from batchpid.sim.options.options import OPTIONS, RunnerOptions, checked_option
-from batchpid.sim.randomization.randomization import Randomization
-from batchpid.sim.robot.robot import Robot
 from batchpid.sim.rollout import Rollout, RunInfo
 from batchpid.sim.runner.arguments import (
     count_ticks,
@@ -69,7 +60,6 @@ from batchpid.sim.tool_space import OperationalSpace
 from batchpid.sim.workers.node import NodeInfo
 from batchpid.sim.workers.pool import Outcome, RecoveryWarning, WorkerPool
 from batchpid.sim.workers.requests import OneCall, Request
-from batchpid.stages import Stage
 from batchpid.stages.values import Command
 
 if TYPE_CHECKING:
@@ -109,9 +99,9 @@ class Runner(SingleOwner):
     workers, first_env, timeout, cluster, backend
         Processes that step the scenes, default one per core, 0 for this process; number of the
         first env; time after which a worker counts as stuck [s]; machines; "numpy" or "jax".
-    on_fault, on_invalid_input, speed_limit
+    on_fault, on_invalid_input
         Failed envs "hold" or "reset"; inputs that are not finite "raise", or are contained by
-        failures ("contain"); joint speed at which an env fails.
+        failures ("contain").
 
     Raises
     ------
@@ -121,72 +111,10 @@ class Runner(SingleOwner):
 
     instead = "make another Runner with the same options, and restore a runner.snapshot() in it"
 
-    def __init__(
-        self,
-        robot: Robot,
-        num_envs: int,
-        *,
-        params: bp.PIDParams | None = None,
-        workers: int | None = None,
-        timestep: float = 1 / 2000,
-        substeps: int = 20,
-        control: ControlMode | Literal["osc"] | Controller = "pid",
-        tool: str | None = None,
-        compensate: Compensation = "gravity+coriolis+friction",
-        free_joints: Sequence[str] | None = None,
-        actuators: bp.Actuators | None = None,
-        plan: bp.Plan | None = None,
-        guard: bool | bp.Guard | None = None,
-        stages: Sequence[Stage] = (),
-        engine: EngineName = DEFAULT_ENGINE,
-        physics: PhysicsPreset | Physics | MujocoSolver = "accurate",
-        collisions: bool = True,
-        ground: bool | None = None,
-        contacts: Sequence[str] | None = None,
-        randomization: Randomization | None = None,
-        on_fault: FaultAction = "hold",
-        wrenches: Sequence[str] | None = None,
-        build: Callable[[Any, int], Any] | None = None,
-        backend: Backend = "numpy",
-        speed_limit: ArrayLike | None = None,
-        on_invalid_input: InvalidInputAction = "raise",
-        first_env: int = 0,
-        timeout: float = 60.0,
-        cluster: Literal["ray"] | Ray | None = None,
-        **unknown: Never,
-    ) -> None:
-        check_keywords("Runner", unknown, OPTIONS)
-        self.options = checked = RunnerOptions(
-            robot,
-            num_envs,
-            params=params,
-            workers=workers,
-            timestep=timestep,
-            substeps=substeps,
-            control=control,
-            tool=tool,
-            compensate=compensate,
-            free_joints=free_joints,
-            actuators=actuators,
-            plan=plan,
-            guard=guard,
-            stages=stages,
-            engine=engine,
-            physics=physics,
-            collisions=collisions,
-            ground=ground,
-            contacts=contacts,
-            randomization=randomization,
-            on_fault=on_fault,
-            wrenches=wrenches,
-            build=build,
-            backend=backend,
-            speed_limit=speed_limit,
-            on_invalid_input=on_invalid_input,
-            first_env=first_env,
-            timeout=timeout,
-            cluster=cluster,
-        )
+    @with_arguments_of(RunnerKeywords)
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        check_keywords("Runner", options, OPTIONS)
+        self.options = checked = RunnerOptions(*arguments, **options)
         """Options, checked."""
         self.robot = checked.robot
         self.num_envs = checked.num_envs

@@ -27,7 +27,7 @@ FULL = LIMITS | {
     "kp": [9.0, 5.0, 3.0],
     "ki": [9.0, 9.0, 5.0],
     "kd": [2.0, 0.6, 0.3],
-    "anti_windup": ["back_calculation", "conditional", "none"],
+    "anti_windup": "back_calculation",
     "tracking_time": 0.05,
     "continuous": [True, False, True],
     "effort_rate_limit": [300.0, 100.0, 60.0],
@@ -38,7 +38,6 @@ FULL = LIMITS | {
 }
 PLAIN = bp.make_params(1, 1.0)
 NAMES = {
-    "non_finite": ("propagate", "zero", "hold"),
     "measurement_rate": ("difference", "measured"),
     "gain_units": ("effort", "mass_matrix"),
 }
@@ -59,7 +58,7 @@ def changes(params, choices):
             if type(chosen) is not type(leaf):
                 yield f"{name}={other}", name, params._replace(**{name: chosen})
         if isinstance(leaf, np.ndarray):
-            is_mask = name in ("continuous", "conditional", "axes")
+            is_mask = name in ("continuous", "axes")
             yield (
                 name,
                 name,
@@ -101,9 +100,9 @@ TARGETS = {
     "C": lambda p: to_c(p, DT),
     "trajectory": lambda p: to_ros2_control(p, JOINTS, DT, inertia=INERTIA),
 }
-PART_OF = {name: "ki" for name in ("integral_min", "integral_max", "tracking_time", "conditional")}
+PART_OF = {name: "ki" for name in ("integral_min", "integral_max", "tracking_time")}
 """Fields of a term, which its own difference contains."""
-LABELS = {"tracking_time": "anti_windup", "conditional": "anti_windup"}
+LABELS = {"tracking_time": "anti_windup"}
 LABELS |= {f"{of}_{end}": f"{of}_limit" for of in ("effort", "integral") for end in ("min", "max")}
 """Options by which differences name the fields."""
 

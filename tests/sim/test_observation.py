@@ -30,8 +30,7 @@ def test_the_tick_does_not_depend_on_the_time_of_the_start(panda):
         first = runner.rollout(np.tile(panda.start, (20, 1)))
         later = runner.rollout(np.tile(panda.start, (2, 1)))
     assert first.tick == later.tick == 3 / 2000
-    assert later.for_ticks(slice(None, None, 2)).tick == 2 * later.tick
-    for each in (later, later.info, later.for_ticks(slice(0, 0))):
+    for each in (later, later.info, later.for_ticks(0, 0)):
         assert len(repr(each).splitlines()) == 1
         assert len(repr(each)) < 100
 
@@ -70,58 +69,34 @@ def test_events_of_some_envs_have_their_new_numbers(rollout):
     ]
 
 
-def test_some_ticks_begin_where_those_before_have_ended(rollout):
+@pytest.mark.parametrize(
+    ("first", "start", "draws"), [(0, True, True), (1, False, False), (3, True, False)]
+)
+def test_some_ticks_begin_where_those_before_have_ended(rollout, first, start, draws):
+    """Unless an env was reset there; its draws are unknown from then on."""
     rollout = with_events(rollout)
-    first, second = rollout.for_ticks(slice(0, 2)), rollout.for_ticks(slice(2, None))
-    np.testing.assert_array_equal(first.info.start, rollout.info.start)
-    # An env was reset in between: where it starts, and its draws, are unknown.
-    assert first.info.draws == rollout.info.draws
-    assert (second.info.start, second.info.draws, second.info.episodes) == (None, None, None)
-    np.testing.assert_array_equal(rollout.for_ticks(slice(4, 6)).changes, np.zeros((2, 3)))
-    # Of ticks that are left out, the changes stay.
-    assert rollout.for_ticks(slice(0, None, 2)).changes[1].tolist() == [0, RESET, RESET]
-    assert rollout.for_ticks(slice(0, 1)).info.faults == rollout.info.faults[:1]
-    joined = Rollout.join([first, second])
-    for name, rows in joined.arrays().items():
-        np.testing.assert_array_equal(rows, rollout.arrays()[name], name)
-
-
-def test_some_ticks_start_at_the_positions_before_them(rollout):
-    np.testing.assert_array_equal(rollout.for_ticks(slice(2, None)).info.start, rollout.qpos[1])
-
-
-def successive(robot, change, *, first=None, second=None):
-    """Return two successive rollouts with further inputs, and a ``change`` of the runner in
-    between.
-    """
-    setpoints = np.tile(robot.start, (3, 1))
-    with Runner(robot, 2, workers=0, params=robot.params(), substeps=2) as runner:
-        part = runner.rollout(setpoints, **(first or {}))
-        change(runner)
-        return [part, runner.rollout(setpoints, **(second or {}))]
+    part = rollout.for_ticks(first)
+    before = rollout.qpos[first - 1] if first else rollout.info.start
+    np.testing.assert_array_equal(part.info.start, before if start else None)
+    assert (part.info.draws == rollout.info.draws) == draws
+    np.testing.assert_array_equal(part.changes, rollout.changes[first:])
+    assert rollout.for_ticks(0, 1).info.faults == rollout.info.faults[:1]
 
 
 def test_joined_rollouts_say_what_was_changed_in_between(panda):
-    def change(runner):
+    setpoints = np.tile(panda.start, (3, 1))
+    with Runner(panda, 2, workers=0, substeps=2) as runner:
+        first = runner.rollout(setpoints, setpoint_rates=0 * setpoints)
         runner.params = panda.params(kp=5.0)
         runner.reset(mask=[True, False])
-
-    given = {"feedforwards": np.ones((3, panda.dof)), "setpoint_rates": np.zeros((3, panda.dof))}
-    parts = successive(panda, change, second=given)
-    joined = Rollout.join(parts)
-    assert joined.changes[1:].tolist() == [[0, 0]] * 2 + [[RESET | PARAMS, PARAMS]] + [[0, 0]] * 2
+        second = runner.rollout(setpoints, feedforwards=np.ones_like(setpoints))
+    joined = Rollout.join([first, second])
+    for name, rows in second.arrays().items():
+        np.testing.assert_array_equal(joined.arrays()[name][3:], rows, name)
+    assert joined.changes[1:4].tolist() == [[0, 0]] * 2 + [[RESET | PARAMS, PARAMS]]
+    assert not joined.feedforward[:3].any()
     assert joined.info.rates
-    np.testing.assert_array_equal(joined.feedforward[:, 0, 0], [0, 0, 0, 1, 1, 1])
-    first = Rollout.join(successive(panda, lambda runner: None, first=given))
-    np.testing.assert_array_equal(first.feedforward[:, 0, 0], [1, 1, 1, 0, 0, 0])
-
-
-def test_rollouts_of_other_runs_are_not_joined(panda):
-    parts = successive(panda, lambda runner: runner.step(panda.start))
-    with pytest.raises(InvalidArgumentError, match=r"part 1 does not go on .* time; join all"):
-        Rollout.join(parts)
-    one, other = (successive(panda, lambda runner: None) for _ in range(2))
-    info = dataclasses.replace(other[1].info, params=panda.params(kp=5.0), engine="sapien")
-    with pytest.raises(InvalidArgumentError, match="the one before it: engine, params"):
-        Rollout.join([one[0], dataclasses.replace(other[1], info=info)])
-    assert len(Rollout.join([one[0], other[1]]).time) == 6
+    assert joined.info.params is first.info.params
+    for parts in ([second, first], [first, second.for_envs([0])]):
+        with pytest.raises(InvalidArgumentError, match="do not follow each other; join"):
+            Rollout.join(parts)

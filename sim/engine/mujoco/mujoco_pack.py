@@ -173,7 +173,7 @@ class MujocoPack(EnginePack):
         """Do one sim step of every robot, with constraint efforts on coupled joints."""
         if self.steps_natively:
             if self._own_step is None:
-                self._own_step = self.compiled_step(False, False, None)
+                self._own_step = self.compiled_step(False, False)
             self._own_step.may_have_failed(self._own_step(self.qf, *np.empty((3, *self.qf.shape))))
             return
         effort = self.qf
@@ -193,13 +193,7 @@ class MujocoPack(EnginePack):
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
         return gravity and coriolis and self._is_model
 
-    def compiled_step(
-        self,
-        gravity: bool,
-        coriolis: bool,
-        speed_limit: Float64 | None,
-        drives: bool = False,
-    ) -> MujocoStep:
+    def compiled_step(self, gravity: bool, coriolis: bool, drives: bool = False) -> MujocoStep:
         arrays = {"qf": self.qf, "sensed": self._sensed}
         if drives:
             arrays |= {"stiffness": self._stiffness, "rate_gain": self._rate_gain}
@@ -209,7 +203,6 @@ class MujocoPack(EnginePack):
             self.models,
             self.rows,
             reads_force,
-            speed_limit,
             arrays,
             self._suspended,
             self._constraint_address,

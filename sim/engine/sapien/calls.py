@@ -124,8 +124,6 @@ class SapienStep(NativeStep):
         to which none are applied.
     stepped
         Mask of the robots that did a sim step (robots,), set in place.
-    speed_limit
-        Joint speed beyond which the status says so (dof,), or None.
     joints
         Joints of all robots, if the targets of their drives move within a tick; else empty.
     sense
@@ -143,7 +141,6 @@ class SapienStep(NativeStep):
         systems: Sequence[PhysxCpuSystem],
         arrays: Mapping[str, Rows],
         stepped: Bool,
-        speed_limit: Float64 | None,
         joints: Sequence[object],
         sense: Callable[[], None] | None,
         **fields: object,
@@ -166,7 +163,6 @@ class SapienStep(NativeStep):
             size,
             dof,
             arrays,
-            speed_limit,
             senses=senses,
             functions=address,
             **fields,

@@ -151,19 +151,12 @@ class Pack(EnginePack):
         # step.
         return self.spec.fixed_base and self._is_model and self._sensors is None
 
-    def compiled_step(
-        self,
-        gravity: bool,
-        coriolis: bool,
-        speed_limit: Float64 | None,
-        drives: bool = False,
-    ) -> SapienStep:
+    def compiled_step(self, gravity: bool, coriolis: bool, drives: bool = False) -> SapienStep:
         return SapienStep(
             self.robots,
             self.systems,
             {"qf": self._joint_qf, "skip": self._suspended},
             self._stepped,
-            speed_limit,
             self._joints if drives else [],
             None if self._sensors is None else self._sensors.add,
             gravity=gravity,

@@ -106,7 +106,7 @@ CASES = {
     "a setpoint outside the limits": Case("out-of-limits", "wrist", (0.0, 0.0, -3.4)),
     "a run that diverges": Case(
         "failed", "lower the gains", (0.1, 0.1, 0.1), gains={"kp": 9e3, "kd": 9e3, "effort_limit": np.inf},
-        options={"speed_limit": 1e3}, seconds=0.5,
+        seconds=0.5,
     ),
     "gains beyond the stability bound": Case("oscillates", "wrist", (0.1, 0.1, 0.1), gains={"kp": 900.0, "kd": 90.0}),
     "gains that ring": Case("oscillates", "shoulder", (0.5, 0.0, 0.0), gains={"kp": 300.0, "kd": 0.05}),
@@ -216,9 +216,7 @@ def test_a_joint_at_its_turning_point_is_not_blocked(kp):
     with Runner(robot, 1, workers=0, engine="mujoco", params=params, ground=False) as runner:
         rollout = runner.rollout(np.tile([0.0, 0.3, 0.0], (200, 1)))
     for ticks in range(30, 200, 10):
-        assert "blocked" not in {
-            each.code for each in rollout.for_ticks(slice(0, ticks)).findings()
-        }
+        assert "blocked" not in {each.code for each in rollout.for_ticks(0, ticks).findings()}
 
 
 def test_joints_at_their_place_do_not_keep_a_tool_from_its_pose(panda):

@@ -36,7 +36,7 @@ def candidates(count=1, delay=0.0, mass=None, **actuators):
     spread = {name: np.repeat(leaf, count, axis=0) for name, leaf in fields.items()}
     spread |= {} if made.max_delay is None else {"max_delay": made.max_delay}
     late = np.full(count, delay)
-    return Candidates(bp.Actuators(**spread), {}, late, 0 * late, {}, mass or {})
+    return Candidates(bp.Actuators(**spread), None, late, 0 * late, {}, mass or {})
 
 
 def stretch_of(commands, start):
@@ -88,7 +88,7 @@ def test_followers_move_with_their_leader(tmp_path):
     rollout = run(robot, setpoints, actuators=ideal)
     made = bp.make_actuators(1, strength=0.9, command_delay=TRUTH["command_delay"])
     drive = control(gains().for_joints([0]))._replace(coupling=Coupling.of(1))
-    candidate = Candidates(made, {}, np.zeros(1), np.zeros(1), {}, {})
+    candidate = Candidates(made, None, np.zeros(1), np.zeros(1), {}, {})
     table = simulated(robot, setpoints[:, :1], drive, candidate, setpoints[0, :1])
     np.testing.assert_allclose(table[:, 0], rollout.qpos[:, 0, 0], atol=1e-4)
 

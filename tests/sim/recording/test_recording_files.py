@@ -69,7 +69,7 @@ def test_rollouts_are_read_as_they_were_written(tmp_path, rollout):
 
 
 def test_rollouts_made_by_hand_and_empty_ones_can_be_written(tmp_path, rollout, panda):
-    bare = replace(rollout, info=RunInfo.of(panda)).for_ticks(slice(0, 0))
+    bare = replace(rollout, info=RunInfo.of(panda)).for_ticks(0, 0)
     with pytest.raises(InvalidArgumentError, match="rollout: holds no tick"):
         bare.plot()
     read = read_recording(write_recording(bare, tmp_path / "run.h5"))

@@ -208,7 +208,7 @@ def test_the_pose_of_the_tool_is_observed(panda):
         np.testing.assert_array_equal(seen.tool_pose, wanted.astype(np.float32))
     assert rollout.info.tool == HAND
     assert rollout.info.units_of("tool_pose") == ("m",) * 3 + ("",) * 4
-    assert rollout.for_envs([1]).for_ticks(slice(2)).tool_pose.shape == (2, 1, 7)
+    assert rollout.for_envs([1]).for_ticks(0, 2).tool_pose.shape == (2, 1, 7)
     with Runner(panda, 1, **OPTIONS) as runner:
         assert runner.reset().tool_pose is None
 
