@@ -77,8 +77,6 @@ class EnginePack(SingleOwner, ABC):
         :attr:`joint_model`.
     steps_natively
         Whether native code does the sim steps, by :meth:`compiled_step`.
-    content
-        Digest of the content that the user's ``build`` added to each env (M,); empty without one.
     calls
         Object that is replaced when earlier results of :meth:`compiled_step` become invalid.
     """
@@ -101,7 +99,6 @@ class EnginePack(SingleOwner, ABC):
         self.dof, self._variation = len(spec.joints), variation or Variation()
         self._masses = VariedMasses(spec, size, self._variation)
         self._suspended: Bool = np.zeros(size, bool)
-        self.content = np.zeros(0, np.int64)
         self.friction = own_friction(spec, self._variation)
         armature = self._variation.armature  # vary() changes its rows
         self.armature = self._motors = np.zeros((1, self.dof)) if armature is None else armature

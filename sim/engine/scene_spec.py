@@ -85,10 +85,8 @@ SOLVERS = {
 
 
 Build = Callable[[Any, int], Any]
-"""``build(scene, env)`` adds content to the engine's scene of env ``env``; returns objects whose
-poses are read.
-
-An object is an entity or the name of a link of the robot, merged links included. None: no poses.
+"""``build(scene, env)`` adds actors to the engine's scene of env ``env``; returns those whose poses
+are read, or None.
 """
 
 

@@ -16,7 +16,7 @@ from batchpid.arrays.array_types import Float64
 from batchpid.errors import RobotError
 from batchpid.sim.description.tables import CONTACT_FRICTION
 from batchpid.sim.engine.sapien.limits import Words, filter_words
-from batchpid.sim.engine.sapien.user_content import Frames, HeadlessScene
+from batchpid.sim.engine.sapien.user_content import HeadlessScene
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.geometry.mesh_files import mesh_bytes
 from batchpid.sim.geometry.shapes import Shape, hull, mesh_file
@@ -260,12 +260,3 @@ def _shape_words(spec: SceneSpec) -> dict[str, list[Words]]:
     for shape in spec.simulated.shapes if spec.collisions else ():
         of_links[shape.body].append(words[shape.owner])
     return of_links
-
-
-def link_frames(spec: SceneSpec, robot: physx.PhysxArticulation) -> Frames:
-    """Return all links of the URDF, in the entities of ``robot``, which is one of ``spec``."""
-    entities = {link.name: link.entity for link in robot.links}
-    return {
-        name: (entities[at.link], None if at.link == name else Pose(at.position, at.wxyz))
-        for name, at in spec.simulated.links.items()
-    }

@@ -29,13 +29,12 @@ from batchpid.sim.engine.sapien.building import (
     RESTITUTION,
     build_scene,
     engine_settings,
-    link_frames,
     new_system,
     set_inertia,
 )
 from batchpid.sim.engine.sapien.calls import SapienStep, obstacle
 from batchpid.sim.engine.sapien.limits import refusals, shortfalls
-from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, write_root
+from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_body, write_root
 from batchpid.sim.engine.scene_spec import PHYSICS, SceneSpec, Variation
 from batchpid.task_space.frames import matrix_of, unrotate
 
@@ -71,12 +70,7 @@ class Pack(EnginePack):
         if spec.build is not None:
             with engine_settings(spec):
                 envs = enumerate(self._scenes, start=first_env)
-                frames = [link_frames(spec, robot) for robot in self.robots]
-                self._contents = [
-                    SceneContent(spec, spec.build, scene, env, frames[env - first_env])
-                    for env, scene in envs
-                ]
-            self.content = np.array([content.digest for content in self._contents])
+                self._contents = [SceneContent(spec.build, scene, env) for env, scene in envs]
         self._damping = np.array([[joint.damping for joint in self.robots[0].active_joints]])
         self.qf = np.zeros((size, self.dof), np.float32)
         coupling = coupling_of(spec.joints)
@@ -222,13 +216,13 @@ class Pack(EnginePack):
         return np.array(~(np.abs(self.read_base()) <= FARTHEST).all(1))
 
     def read_base(self) -> Float64:
-        roots = np.array([read_root(robot) for robot in self.robots], np.float64)
+        roots = np.array([read_body(robot.root) for robot in self.robots], np.float64)
         return self._moved_to_origin(range(self.size), roots, -1.0)
 
     def read_base_motion(self) -> Float64 | None:
         if self.spec.fixed_base:
             return None
-        roots = np.array([read_root(robot) for robot in self.robots], np.float64)
+        roots = np.array([read_body(robot.root) for robot in self.robots], np.float64)
         turn = matrix_of(roots[:, 3:7])
         parts = np.array(self.spec.gravity), roots[:, 10:]
         return np.concatenate([unrotate(turn, part) for part in parts], axis=1)
@@ -355,26 +349,21 @@ class Pack(EnginePack):
                 joint.set_pose_in_parent(frames[0])
                 joint.set_pose_in_child(frames[1])
 
-    def state_sizes(self) -> list[int]:
-        """Return the number of values in the state of each scene: of the robot, and of its
-        content.
-        """
-        robot = 2 * self.dof + ROOT_SIZE + self._turning.size
-        return [robot + content.size for content in self._contents] or [robot] * self.size
-
     def read_state(self) -> Float64:
         """Return the state of each scene (M, values): qpos, qvel, root, positions without jumps of
         coupled continuous joints, content, then NaN.
         """
-        sizes = self.state_sizes()
-        states = np.full((self.size, max(sizes)), np.nan)
+        rows = []
         for row, robot in enumerate(self.robots):
             content = [scene.read() for scene in self._contents[row : row + 1]]
             turned = (
                 [] if self._constraint is None else self._constraint.unwrapped[row, self._turning]
             )
-            parts = robot.get_qpos(), robot.get_qvel(), read_root(robot), turned, *content
-            states[row, : sizes[row]] = np.concatenate(parts)
+            parts = robot.get_qpos(), robot.get_qvel(), read_body(robot.root), turned, *content
+            rows.append(np.concatenate(parts, dtype=np.float64))
+        states = np.full((self.size, max(map(len, rows))), np.nan)
+        for state, values in zip(states, rows, strict=True):
+            state[: len(values)] = values
         return states
 
     def write_state_rows(self, states: Float64) -> None:
