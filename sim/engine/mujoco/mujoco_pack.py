@@ -28,7 +28,7 @@ from batchpid.sim.engine.mujoco.model_builder import (
     robot_model,
     set_inertia,
 )
-from batchpid.sim.engine.mujoco.mujoco_sensors import MujocoLinkSensors
+from batchpid.sim.engine.mujoco.mujoco_sensors import MujocoLinkSensors, wrench_tables
 from batchpid.sim.engine.mujoco.mujoco_step import STATE, DataPool, MujocoStep, obstacle, rest
 from batchpid.sim.engine.native import FARTHEST
 from batchpid.sim.engine.protocol import BASE_AT_REST, Engine, EnginePack
@@ -118,7 +118,10 @@ class MujocoPack(EnginePack):
         if self._free is None:
             self._evaluate(rows)
         else:
-            self._free.use(self.models)
+            wrenches = {}
+            if self.spec.wrenches:
+                wrenches = wrench_tables(self.spec, self._masses.added, self.size)
+            self._free.use(self.models, wrenches)
         self.calls = object()
         self._own_step: MujocoStep | None = None
 
