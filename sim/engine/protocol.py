@@ -20,11 +20,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from batchpid.arrays.array_types import Bool, Float64, Rows
+from batchpid.arrays.array_types import Bool, Float32, Float64, Rows
 from batchpid.checks import choice
 from batchpid.errors import InvalidArgumentError, MissingDependencyError, SingleOwner
 from batchpid.io.files import imported
 from batchpid.motors import Actuators
+from batchpid.sim.description.merging import coupling_of
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.native_model import NativeModel, NativeStep, TreeModel
 from batchpid.sim.engine.scene_spec import (
@@ -136,6 +137,23 @@ class EnginePack(SingleOwner, ABC):
         state = self.read_qpos(), self.read_qvel(), gravity, coriolis, self.read_base_motion()
         return model.passive_force(*state)
 
+    def _couple(self, wraps: Bool, force: TreeModel | None, asked: Float32 | None = None) -> None:
+        """Make the constraint efforts, if joints are coupled: see :class:`.ConstraintEfforts`."""
+        coupling = coupling_of(self.spec.joints)
+        if coupling.is_identity:
+            return
+        self._constraint = ConstraintEfforts(
+            self.size, coupling, wraps, self.spec.timestep, self.joint_model, force, asked
+        )
+        self._add_joints(None)
+
+    def update_constraint(self, rows: Sequence[int] | slice = slice(None)) -> None:
+        """Update the mass matrix in the constraint efforts of robots ``rows``, if joints are
+        coupled.
+        """
+        if self._constraint is not None:
+            self._constraint.update(self.read_qpos(), self._bias(), rows)
+
     @property
     def _constraint_address(self) -> int | None:
         return None if self._constraint is None else self._constraint.address
@@ -190,9 +208,9 @@ class EnginePack(SingleOwner, ABC):
         """Apply joint efforts [N m or N]. They persist until written again."""
 
     @abstractmethod
-    def update_constraint(self, rows: Sequence[int] | slice = slice(None)) -> None:
-        """Update the mass matrix in the constraint efforts of robots ``rows``, if joints are
-        coupled.
+    def _bias(self) -> Float64:
+        """Return the forces in the equations of motion of the joints (M, dof), for the constraint
+        efforts.
         """
 
     @abstractmethod

@@ -100,7 +100,8 @@ class SceneSpec:
     scenes have no collision shapes and no ground, but the same masses and inertias. ``mjcf`` is the
     file that MuJoCo compiles in place of ``tables``. ``contacts`` and ``wrenches`` are links with
     sensors. ``carrier`` is the link that carries payloads, and ``varied_links`` are those whose mass
-    or center of mass varies. Specs that differ in ``build`` alone are equal.
+    or center of mass varies. With ``drives`` the engine's drives move the joints. Specs that differ
+    in ``build`` alone are equal.
     """
 
     tables: Tables
@@ -119,6 +120,7 @@ class SceneSpec:
     mjcf: MjcfFile | None = None
     carrier: str = ""
     varied_links: tuple[str, ...] = ()
+    drives: bool = False
 
     @property
     def simulated(self) -> Tables:

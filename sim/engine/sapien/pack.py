@@ -21,8 +21,6 @@ from sapien import Pose, physx
 
 from batchpid.arrays.array_types import Bool, Float32, Float64, Rows
 from batchpid.motors import Actuators
-from batchpid.sim.description.merging import coupling_of
-from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.native import FARTHEST
 from batchpid.sim.engine.protocol import BASE_AT_REST, Engine, EnginePack
 from batchpid.sim.engine.sapien.building import (
@@ -73,19 +71,13 @@ class Pack(EnginePack):
                 self._contents = [SceneContent(spec.build, scene, env) for env, scene in envs]
         self._damping = np.array([[joint.damping for joint in self.robots[0].active_joints]])
         self.qf = np.zeros((size, self.dof), np.float32)
-        coupling = coupling_of(spec.joints)
+        continuous = np.array([joint.continuous for joint in spec.joints], bool)
+        self._couple(continuous, None, self.qf)
         self._joint_qf = self.qf
         self._turning = np.array([], np.intp)
-        if not coupling.is_identity:
+        if self._constraint is not None:
             self._joint_qf = np.zeros_like(self.qf)
-            continuous = np.array([joint.continuous for joint in spec.joints])
             self._turning = np.flatnonzero(continuous)
-            self._constraint = ConstraintEfforts(size, coupling, continuous, spec.timestep, self.qf)
-            self._constraint.implicit[...] = [
-                [joint.armature[0] for joint in self.robots[0].active_joints]
-            ]
-            if self.steps_natively:
-                self._constraint.use(self.joint_model, None)
         self._bind()
         if variation is not None:
             self.write_joints(None)
@@ -145,10 +137,8 @@ class Pack(EnginePack):
             constraint=self._constraint_address,
         )
 
-    def update_constraint(self, rows: Sequence[int] | slice = slice(None)) -> None:
-        if self._constraint is not None:
-            passive = self._own_force(True, True)
-            self._constraint.update(self.joint_model.mass_matrix, self.read_qpos(), passive, rows)
+    def _bias(self) -> Float64:
+        return self._own_force(True, True)
 
     def _renew(self, rows: Sequence[int]) -> None:
         """Rebuild the robots ``rows`` in new systems, in which earlier contacts have no influence
