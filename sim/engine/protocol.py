@@ -143,7 +143,13 @@ class EnginePack(SingleOwner, ABC):
         if coupling.is_identity:
             return
         self._constraint = ConstraintEfforts(
-            self.size, coupling, wraps, self.spec.timestep, self.joint_model, force, asked
+            self.size,
+            coupling,
+            wraps,
+            self.spec.timestep,
+            self.joint_model,
+            force,
+            asked,
         )
         self._add_joints(None)
 
