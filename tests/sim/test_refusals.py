@@ -22,7 +22,6 @@ from batchpid.sim import (
     OperationalSpace,
     Physics,
     Randomization,
-    Recorder,
     Robot,
     Runner,
     Uniform,
@@ -337,14 +336,6 @@ def test_a_refused_call_names_its_argument_and_changes_nothing(options, calls):
             assert is_refused(runner, partial(act, runner, name, arguments), next(iter(arguments)))
         size = runner.options.command.size
         assert runner.step(np.zeros(size) if runner.robot.fixed_base else start.qpos).ok.all()
-
-
-@pytest.mark.parametrize("arguments", [("run.txt",), (3,), ("run.h5", None)])
-def test_a_recorder_that_is_refused_is_not_attached(arguments):
-    with Runner(**GOOD[Runner]) as runner:
-        with pytest.raises(BatchPIDError):
-            Recorder(*(*arguments, runner)[:2])
-        assert runner.recorder is None
 
 
 @pytest.mark.parametrize(
