@@ -171,19 +171,14 @@ class EnvGroup:
 
         Floating bases are placed at ``base`` (M, 13): pose and twist. ``draws`` apply to all envs
         from now on; they differ from the previous draws in these envs alone.
-
-        An env whose ``qpos`` or ``qvel`` is not finite returns to its last start, and has failed.
         """
         self._draws = draws
         if mask.any():
             faults = self._faults
             faults.clear(mask)
             self._vary(mask, draws)
-            wrong = faults.take_starts(mask, qpos, qvel, base)
+            faults.take_starts(mask, qpos, qvel, base)
             self._place(mask, faults.start_qpos, faults.start_qvel)
-            for cause, entries in wrong.items():
-                faults.fail(entries, cause, self.steps, faults.start_qpos)
-            self._place_failed()
         self.observe(self._at(0))
 
     def _vary(self, mask: NDArray[np.bool_], draws: Draws) -> None:

@@ -177,22 +177,13 @@ class OwnController:
         efforts (M, dof).
 
         Raises InvalidArgumentError if the controller returned an effort or a state of a wrong shape
-        or dtype, or JAX cannot trace it.
+        or dtype.
         """
         xp = namespace(*inputs[1:3])
         if xp is np:
             # The controller may keep them, but not write to them.
             return self._checked(state, [read_only(np.array(rows)) for rows in inputs], xp)
-        import jax
-
-        try:
-            return self._checked(state, inputs, xp)
-        except (TypeError, jax.errors.JAXTypeError, jax.errors.JAXIndexError) as error:
-            raise InvalidArgumentError(
-                "control",
-                f"cannot be traced by JAX: {str(error).splitlines()[0]}",
-                remedy="write it in jax.numpy, or use backend='numpy'",
-            ) from error
+        return self._checked(state, inputs, xp)
 
     def _checked(self, state: Document, inputs: Sequence[Array], xp: Any) -> tuple[Array, ...]:
         new, returned, *limited = self._called(unflatten(self._structure, state), *inputs)
