@@ -21,7 +21,7 @@ from batchpid.sim.loop.arrays import Arrays, Snapshot
 from batchpid.sim.loop.faults import CAUSES, MOST_EVENTS, NO_STEP, Fault
 from batchpid.sim.options.options import IDEAL, RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
-from batchpid.sim.rollout import ACTUATORS, PARAMS, RESET, RESTORE
+from batchpid.sim.rollout import PARAMS, RESET, RESTORE
 from batchpid.sim.runner.arguments import base_rows, joint_rows
 from batchpid.sim.workers.pool import Outcome
 from batchpid.sim.workers.requests import Request
@@ -152,8 +152,6 @@ def committed(options: RunnerOptions, state: RunnerState, outcome: Outcome) -> R
         return _after_restore(state, *arguments)
     if method == "set_params":
         return state.changed(PARAMS, params=arguments[0])
-    if method == "set_actuators":
-        return state.changed(ACTUATORS, actuators=arguments[0])
     if method == "snapshot":
         return state._replace(steps_since_checkpoint=0)
     return state

@@ -119,6 +119,12 @@ class Start:
     of the envs.
     """
 
+    @property
+    def label(self) -> str:
+        """Number and envs, for messages."""
+        first = self.first_env + self.envs.start
+        return f"{self.index} (envs {first} to {self.first_env + self.envs.stop - 1})"
+
     def build(self, arrays: Arrays) -> Loop:
         """Return the loop, with the shared arrays (ticks, envs, ...) of the pool's envs."""
         envs = slice(self.first_env + self.envs.start, self.first_env + self.envs.stop)

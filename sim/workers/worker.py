@@ -102,16 +102,6 @@ class Worker(SingleOwner, ABC):
         limit: float = self._step_limit * steps + self._timeout + patience
         return limit
 
-    @property
-    def label(self) -> str:
-        """Number, process and envs, for messages."""
-        first = self._start.first_env
-        process = "" if self.pid is None else f"pid {self.pid}, "
-        return (
-            f"{self._start.index} ({process}envs {first + self.envs.start} to"
-            f" {first + self.envs.stop - 1})"
-        )
-
 
 class LocalWorker(Worker):
     """Loop in this process."""
@@ -204,13 +194,10 @@ class ProcessWorker(Worker):
 
     def receive(self) -> object:
         try:
-            result = pickle.load(self._answers)
+            return pickle.load(self._answers)
         except (EOFError, OSError, pickle.UnpicklingError) as error:
             self._raise_early(error)
             raise self._lost(error) from error
-        if isinstance(result, Failure):
-            return result.of_worker(f"worker {self.label}")
-        return result
 
     def let_go(self) -> None:
         """Close the pipe in a forked child of the caller, which may live longer than the caller:
@@ -242,7 +229,7 @@ class ProcessWorker(Worker):
                 cause = f"died ({signal.strsignal(-code)})"
             else:
                 cause = f"died (exit code {code})"
-        return WorkerLost(f"worker {self.label} {cause}")
+        return WorkerLost(f"worker {self._start.label} {cause}")
 
 
 _workers = WeakSet[ProcessWorker]()
@@ -317,10 +304,11 @@ def serve() -> None:
 def _serve(connection: socket.socket, memory: int) -> None:
     requests = connection.makefile("rb")
     start, layout = pickle.load(requests)
+    worker = f"worker {start.label}"
     try:
         loop: Loop = start.build(SharedArrays(layout, memory).arrays)
     except Exception as error:
-        connection.sendall(pickle.dumps(failed(error).portable()))
+        connection.sendall(pickle.dumps(failed(error).portable(worker)))
         return
     connection.sendall(pickle.dumps(None))
     # The hot loop makes no reference cycles, so that collections would only cost time.
@@ -335,5 +323,5 @@ def _serve(connection: socket.socket, memory: int) -> None:
             os.sched_yield()
         result = loop.execute(*pickle.load(requests))
         if isinstance(result, Failure):
-            result = result.portable()
+            result = result.portable(worker)
         connection.sendall(pickle.dumps(result))

@@ -13,13 +13,12 @@ import pytest
 from identical import assert_identical
 from robots import load_bundled
 
-import batchpid as bp
 from batchpid.errors import ClosedError, InvalidArgumentError
 from batchpid.sim import Recorder, RecordingError, Runner, read_recording
 from batchpid.sim.cli import main
 from batchpid.sim.recording import recorder as recorder_module
 from batchpid.sim.robot.robot_options import content
-from batchpid.sim.rollout import ACTUATORS, PARAMS, RESET, RESTORE
+from batchpid.sim.rollout import PARAMS, RESET, RESTORE
 
 ROBOT = load_bundled("panda")
 N = 3
@@ -75,15 +74,10 @@ def set_params(runner):
     runner.params = ROBOT.params(kp=5.0)
 
 
-def set_actuators(runner):
-    runner.actuators = bp.make_actuators(ROBOT.dof, strength=0.5)
-
-
 CHANGES = {
     reset: [RESET, 0, RESET],
     restore: [RESTORE] * N,
     set_params: [PARAMS] * N,
-    set_actuators: [ACTUATORS] * N,
 }
 """Every method that changes the state of a runner, and what its recording says of each env."""
 
