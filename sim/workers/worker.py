@@ -13,7 +13,6 @@ import contextlib
 import faulthandler
 import fcntl
 import gc
-import json
 import os
 import pickle
 import select
@@ -42,10 +41,7 @@ ONE_THREAD |= {"NPROC": "1", "JAX_CPU_ENABLE_ASYNC_DISPATCH": "0", "JAX_PLATFORM
 """Environment of a process whose BLAS uses one thread, and whose JAX computes on the CPU, on the
 caller's thread.
 """
-_PROGRAM = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); import batchpid.sim.workers.worker"
-    " as w; w.serve()"
-)
+_PROGRAM = "from batchpid.sim.workers.worker import serve; serve()"
 
 
 class WorkerLost(WorkerError):
@@ -143,7 +139,7 @@ class ProcessWorker(Worker):
         paths = [path for path in sys.path if isinstance(path, str)]
         # Where "" led to, before the caller changed the folder.
         paths.append(str(Path(__file__).parents[3]))
-        environment = os.environ | ONE_THREAD
+        environment = os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join(paths)}
         if native.obstacle():
             environment[native.SWITCH] = "0"  # one warning for all
         with standard_streams_occupied():
@@ -153,14 +149,7 @@ class ProcessWorker(Worker):
                 descriptors = theirs.fileno(), self._shared.fd
                 self._process = process = subprocess.Popen(
                     # -P: without it the working folder comes first, and a json.py in it would run.
-                    [
-                        sys.executable,
-                        "-P",
-                        "-c",
-                        _PROGRAM,
-                        json.dumps(paths),
-                        *map(str, descriptors),
-                    ],
+                    [sys.executable, "-P", "-c", _PROGRAM, *map(str, descriptors)],
                     stdin=subprocess.PIPE,
                     pass_fds=descriptors,
                     env=environment,
