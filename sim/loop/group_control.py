@@ -19,7 +19,7 @@ from batchpid.arrays.trees import leaves, mapped
 from batchpid.motors.friction import Friction
 from batchpid.native.extensions import MOST_SUMMED
 from batchpid.sim.description.merging import coupling_of
-from batchpid.sim.engine.native_model import NativeRefresh, mass_matrix_of, passive_force_of
+from batchpid.sim.engine.native_model import NativeRefresh
 from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.env_parts import OwnController
 from batchpid.sim.options.options import RunnerOptions
@@ -231,22 +231,23 @@ def model_functions(pack: EnginePack, control: Control) -> Model:
     falls = not pack.spec.fixed_base  # then gravity does not load the joints
 
     def joint_mass_matrix(qpos: Float64) -> Float64:
-        matrix = pack.joint_mass_matrix(qpos)
+        matrix: Float64 = pack.joint_model.mass_matrix(qpos)
         if pack.armature.any():
             return matrix + pack.armature[:, None] * np.eye(pack.dof)
         return matrix
 
     model = Model(
-        mass_matrix=mass_matrix_of(pack, native),
+        mass_matrix=lambda qpos: pack.force_model.mass_matrix(qpos),
         joint_mass_matrix=joint_mass_matrix,
         load=lambda: pack.passive_force(not falls, True),
         envs=np.arange(pack.first_env, pack.first_env + pack.size),
     )
     if control.gravity:
-        force = passive_force_of(pack, native)
         parts = control.gravity, control.coriolis
         model = model._replace(
-            passive_force=lambda qpos, qvel: force(qpos, qvel, *parts, pack.read_base_motion())
+            passive_force=lambda qpos, qvel: pack.force_model.passive_force(
+                qpos, qvel, *parts, pack.read_base_motion()
+            )
         )
     if native and control.friction.coulomb is not None:
         inputs = control.friction, control.drive, control.coupling, control.timestep

@@ -164,12 +164,11 @@ class SceneOptions(OptionGroup):
     """
     contacts: Annotated[Sequence[str] | None, option("snapshot", "recording", "scene")] = None
     """Links whose contact forces are observed: ``obs.contact_force`` and ``obs.touching``; default
-    none. Each link senses the contacts of its own shapes. A fixed base is refused. SAPIEN needs
-    ``dissipation="urdf"``.
+    none. Each link senses the contacts of its own shapes. A fixed base is refused.
     """
     wrenches: Annotated[Sequence[str] | None, option("snapshot", "recording", "scene")] = None
     """Links with a sensor of the force and torque that the parent exerts on the link:
-    ``obs.wrench``; default none. SAPIEN needs ``dissipation="urdf"``.
+    ``obs.wrench``; default none. It needs ``engine="mujoco"``.
     """
     build: Annotated[Callable[[Any, int], Any] | None, option("snapshot", "scene")] = None
     """Function ``build(scene, env)`` that adds user content to the ``sapien.Scene`` of each env;
@@ -284,11 +283,8 @@ class SceneOptions(OptionGroup):
         links = tuple(names(argument, value))
         if not links:
             return None
-        # SAPIEN reports its damping of links among the contacts.
-        if self.engine == "sapien" and robot.source.dissipation == "sapien":
-            problem = "need a robot without SAPIEN's link damping, which acts like a contact"
-            remedy = "load the robot with dissipation='urdf'"
-            raise InvalidArgumentError(argument, problem, remedy=remedy)
+        if argument == "wrenches":
+            require(self.load_engine(), "wrenches", argument)
         # A link that no joint moves has no sensor: it is part of the root's body.
         bodies = place_links(robot.tables, links if argument == "wrenches" else ())
         root = next(place.link for place in bodies.values())

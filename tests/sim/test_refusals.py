@@ -213,6 +213,7 @@ REFUSED = {
         {"contacts": ["foot"]},
         {"contacts": "hand"},
         {"wrenches": ["base"]},
+        {"wrenches": ["hand"], "engine": "sapien"},
         {"collisions": False, "robot": FREE},
         {"control": "osc", "robot": FREE},
         {"robot": SAPIENS_OWN, "engine": "mujoco"},

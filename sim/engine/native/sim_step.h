@@ -12,7 +12,7 @@ namespace batchpid {
 constexpr double FARTHEST = 1e6;
 
 // Reasons for which a loop over sim steps has to stop, as bits.
-enum Status : std::int32_t { NOT_FINITE = 1, FAILED = 2, NO_NOISE = 4, SENSE = 8 };
+enum Status : std::int32_t { NOT_FINITE = 1, FAILED = 2, NO_NOISE = 4 };
 
 // Group of robots; Python fills in the fields and owns what they point to.
 struct FOR_PYTHON Group {
@@ -27,7 +27,6 @@ struct FOR_PYTHON Group {
   FreeMotion const *lanes;           // robots without an engine, or null
   std::int64_t robots, dof;
   std::int32_t gravity, coriolis;    // parts of the passive force; without both it is zero
-  std::int32_t senses;               // whether Python reads sensors after each sim step
   char message[256];                 // of an exception of the engine
 };
 
@@ -276,7 +275,7 @@ inline std::int32_t try_sim_step(Group &group, double const *effort, double *qpo
                                             : succeeds(group.message, in_sapien);
   if (!good) return FAILED;
   std::int64_t const dof = group.dof;
-  std::int32_t status = group.senses != 0 ? SENSE : 0;
+  std::int32_t status = 0;
   std::int64_t far = 0;  // counted, since a loop without branches is of vectors
   for (std::int64_t at = 0; at < group.robots * dof; ++at) far += !(std::fabs(qpos[at]) <= FARTHEST);
   if (far != 0) status |= NOT_FINITE;
