@@ -154,7 +154,6 @@ def test_a_call_with_any_value_changes_nothing_if_it_is_refused(contain):
             "reset": {"qpos": ROW, "qvel": ROW, "mask": np.ones(N, bool), "seed": None},
             "restore": {"snapshot": None},
             "params": {"params": PARAMS},
-            "actuators": {"actuators": None},
         }
         for method, good in calls.items():
             for name, value in product(good, ODD):
