@@ -125,8 +125,6 @@ class RunInfo:
     """Versions of the packages that results depend on, by name."""
     begun: str | None = None
     """Local date and time of the start, ISO 8601."""
-    complete: bool = True
-    """False for a recording that was cut short, or is still being written."""
     faults: tuple[Any, ...] = ()
     """Faults (:class:`batchpid.sim.Fault`) of the runner up to the end of the run."""
     randomization: Document | None = None

@@ -14,7 +14,7 @@ from dataclasses import replace
 from functools import cached_property
 from operator import itemgetter, methodcaller
 from time import strftime
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.arrays.array_types import Float64, Progress
 from batchpid.checks import check_keywords, choice, instance
-from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError, SingleOwner, warn
+from batchpid.errors import ClosedError, InvalidArgumentError, SingleOwner, warn
 from batchpid.io.files import package_versions
 from batchpid.sim.diagnosis.loop_stability import StabilityCheck
 from batchpid.sim.findings import report_shortfalls
@@ -60,9 +60,6 @@ from batchpid.sim.tool_space import OperationalSpace
 from batchpid.sim.workers.pool import Outcome, RecoveryWarning, WorkerPool
 from batchpid.sim.workers.requests import OneCall, Request
 from batchpid.stages.values import Command
-
-if TYPE_CHECKING:
-    from batchpid.sim.recording.recorder import Recorder
 
 CHECKPOINT_STEPS = 8000
 """Least number of sim steps between checkpoints, from the last of which a lost worker is replayed."""
@@ -120,12 +117,8 @@ class Runner(SingleOwner):
         self.control = checked.control
         self.timestep = checked.timestep
         self.substeps = checked.substeps
-        self.recorder: Recorder | None = None
-        """Recorder of every tick; :class:`batchpid.sim.Recorder` sets it."""
         self._call = OneCall()
         self._state = RunnerState.first(checked)
-        self._sent: Request | None = None  # by send(), until recv()
-        self._is_running = False  # whether the workers run it
         self._cause: BaseException | None = None  # of the end
         self._has_warned = False  # of a fault
         self._stability: StabilityCheck | None = None
@@ -203,12 +196,6 @@ class Runner(SingleOwner):
         base_twist
             Velocity of that link's origin and its angular velocity, along the axes of the world,
             (6,) or (envs, 6) [m/s, rad/s]; default 0.
-
-        Raises
-        ------
-        CallOrderError
-            The observation of a tick that was sent has not been received, as for :meth:`step`,
-            :meth:`rollout` and :meth:`restore`.
         """
         self._ready()
         base = {"base_pose": base_pose, "base_twist": base_twist}
@@ -266,67 +253,10 @@ class Runner(SingleOwner):
         substeps
             Sim steps of this tick; default the runner's.
         """
-        if self._sent is not None or self._pool.closed:
+        if self._pool.closed:
             self._ready()
         command = setpoint, setpoint_rate, setpoint_acceleration, feedforward
         self._execute(self._tick(command, latency, substeps))
-        return self._observed()
-
-    def send(
-        self,
-        setpoint: ArrayLike | None,
-        *,
-        setpoint_rate: ArrayLike | None = None,
-        setpoint_acceleration: ArrayLike | None = None,
-        feedforward: ArrayLike | None = None,
-        latency: ArrayLike = 0.0,
-        substeps: int | None = None,
-    ) -> None:
-        """Begin a tick and return, while the workers run it; :meth:`recv` returns its observation.
-
-        The two are bit-identical to one :meth:`step`, and take its arguments. In between,
-        :attr:`time`, :attr:`faults` and the like are those of the tick before; :attr:`info`,
-        assignments, and all methods but :meth:`recv` and :meth:`close` raise CallOrderError. With
-        ``workers=0`` the tick runs in this call.
-
-        Raises
-        ------
-        CallOrderError
-            The observation of the last tick that was sent has not been received.
-        """
-        self._ready()
-        command = setpoint, setpoint_rate, setpoint_acceleration, feedforward
-        run = self._tick(command, latency, substeps)
-        self._prepare(run)
-        self._call.begin()
-        try:
-            self._call.waits = True
-            self._pool.begin(run)
-            self._sent = run
-            self._is_running = True
-        except BaseException as error:
-            self._fail(error)
-            raise
-        finally:
-            if self._pool.closed:
-                self._pool.close()
-            self._call.end()
-
-    def recv(self) -> Observation:
-        """Wait for the end of the tick that :meth:`send` began; return its observation. After an
-        interrupt it can be called again.
-
-        Raises
-        ------
-        CallOrderError
-            No tick was sent since the last call.
-        """
-        self._check_open()
-        if self._sent is None:
-            raise CallOrderError("no tick was sent; call send(setpoint) first")
-        if self._is_running:
-            self._execute(self._sent)
-        self._sent = None
         return self._observed()
 
     def rollout(
@@ -412,7 +342,7 @@ class Runner(SingleOwner):
         # A signal handler may have closed the runner after the tick.
         present: Any = getattr(self._pool, "present", None)
         if present is None:
-            self._check_open()
+            self._ready()
         return self._with_tool(present.observation.map(COPY))
 
     def _with_tool(self, seen: Observation) -> Observation:
@@ -633,19 +563,6 @@ class Runner(SingleOwner):
     # -------------------------------------------------------------------------------------
 
     def _ready(self) -> None:
-        """Check that no tick was sent, and as :meth:`_check_open`.
-
-        Raises
-        ------
-        CallOrderError
-            The observation of a tick that was sent has not been received.
-        """
-        self._check_open()
-        if self._sent is not None:
-            problem = "the observation of the last tick has not been received"
-            raise CallOrderError(f"{problem}; call recv() first")
-
-    def _check_open(self) -> None:
         """Check that the runner can be used.
 
         Raises
@@ -675,10 +592,6 @@ class Runner(SingleOwner):
             count = self.substeps
         else:
             count = checked_option("substeps", substeps)
-        if self.recorder is not None and count != self.substeps:
-            problem = f"is not the runner's {self.substeps}"
-            remedy = "all ticks of a recording have the same length"
-            raise InvalidArgumentError("substeps", problem, value=count, remedy=remedy)
         inputs = dict(zip(Command._fields, arrays, strict=True))
         command, chunks = self._command(inputs, latency, count * self.timestep)
         for chunk in chunks:
@@ -723,30 +636,25 @@ class Runner(SingleOwner):
             self._execute(Request("add_chunk", (chunk, latency)))
 
     def _execute(self, request: Request) -> Outcome:
-        """Execute a request, or complete the one that was sent; then issue warnings.
+        """Execute a request, then issue warnings.
 
         Ctrl-C does not interrupt it between the request and the new state. The runner is closed if
         the workers cannot complete the request, or if a second Ctrl-C ends it.
         """
         call = self._call
         pool = self._pool
-        is_sent = self._is_running
         is_run = request.method == "run"
-        if not is_sent:
-            self._prepare(request)
+        self._prepare(request)
         # From here on Ctrl-C waits, so that workers and state change together or not at all.
         call.begin()
         try:
-            call.waits, before = True, self._state
-            if not is_sent:
-                pool.begin(request)
+            call.waits = True
+            pool.begin(request)
             outcome = pool.finish()
-            call.waits = self._is_running = False
+            call.waits = False
             # Ticks before a failure count: the workers have run them.
             if outcome.failure is None or is_run:
-                self._state = committed(self.options, before, outcome)
-            if is_run and self.recorder is not None:
-                self._record(self.recorder, before, outcome)
+                self._state = committed(self.options, self._state, outcome)
             if outcome.failure is not None and request.changes_loop:
                 self._fail(outcome.failure.error)
         except BaseException as error:
@@ -769,8 +677,7 @@ class Runner(SingleOwner):
         return outcome
 
     def _prepare(self, request: Request) -> None:
-        """Take a checkpoint if one is due, before ticks or a reset, and let the recorder keep the
-        state before its first tick.
+        """Take a checkpoint if one is due, before ticks or a reset.
 
         Before a reset it is one that the loops do not notice. It holds all that there is of an env
         after its next reset. With ``build`` that is not so: the user's content is not rebuilt.
@@ -779,8 +686,6 @@ class Runner(SingleOwner):
         if request.method == "run":
             if is_due and self._keeps_bits:
                 self._take_snapshot()
-            if self.recorder is not None:
-                self.recorder.prepare()
         elif is_due and request.method == "reset":
             keeps_rest = self._keeps_bits or self.options.build is not None
             if not (keeps_rest or self._pool.replay.waits):
@@ -792,18 +697,6 @@ class Runner(SingleOwner):
     def _keeps_bits(self) -> bool:
         """Whether envs go on with the same bits after a snapshot as without it."""
         return "complete_state" in self.options.load_engine().capabilities
-
-    def _record(self, recorder: Recorder, before: RunnerState, outcome: Outcome) -> None:
-        """Pass completed ticks on to the recorder."""
-        run = outcome.request
-        for number, arrays in enumerate(outcome.completed):
-            time = (before.steps + (number + 1) * run.substeps) * self.timestep
-            recorder.append(
-                time,
-                run.command.map(itemgetter(number)),
-                self._with_tool(arrays.observation.map(COPY)),
-                None if number else before.changes,
-            )
 
     def _fail(self, error: BaseException) -> None:
         """End the runner, which cannot complete a command."""

@@ -47,9 +47,7 @@ def run_of(xp, dtype, seed, own):
     yield (guarded := guards.init(limits, y))
     yield guards.advance(limits, guarded, row["setpoint"], DT)[0]
     motors = bp.make_actuators(JOINTS, **MOTORS, dtype=own)
-    yield (moved := bp.motors.init(motors, y, DT, qvel=v, effort=u))
-    yield from bp.motors.deliver(motors, moved, u, y, v, DT)
-    yield from bp.motors.measure(motors, moved, y, v, DT)
+    yield bp.motors.init(motors, y, DT, qvel=v, effort=u)
 
 
 MOTORS = {"command_delay": 0.02, "sensor_delay": 0.01, "lag": 0.1, "backlash": 0.1}
@@ -85,11 +83,11 @@ def test_a_controller_keeps_the_precision_that_it_was_built_with(x64):
 def test_operational_space():
     tree = tree_of("panda")
     qpos = np.zeros((2, tree.dof), np.longdouble)
-    params = ts.make_osc_params(tree, integral_gain=1.0)
+    params = ts.make_osc_params(tree, DT, integral_gain=1.0)
     state = ts.init(params, qpos)
     goal = ts.link_poses(tree, qpos, ["panda_hand"])[:, 0].astype(np.longdouble)
     new, terms = ts.osc(
-        ts.discretise(params, DT),
+        params,
         state,
         ts.Tool(tree, "panda_hand"),
         ts.OSCInputs(goal, qpos, qpos),

@@ -21,7 +21,6 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import LAW_FIELDS
 from batchpid.motors import friction, guard
 from batchpid.motors.actuators import ACTUATOR_FIELDS
-from batchpid.task_space import osc_params
 
 NAMES = ["shoulder", "elbow"]
 
@@ -91,7 +90,6 @@ def test_choices_of_the_law(name):
         refused(name, bp.make_params, 2, 1.0, **{name: value})
 
 
-AXIS = [True] + [False] * 5
 COMBINATIONS = {
     bp.make_params: [
         {"kp": None},
@@ -124,24 +122,21 @@ COMBINATIONS = {
     bp.make_guard: [{"lower": 1.0, "upper": 0.0}],
     bp.make_plan: [
         {"fade": 1.0, "blend": "newest"},
-        *({"taper": 0.1}, {"latest": [3]}, {"acceleration": 0.0}, {"period": 0.0}, {"horizon": 0}),
+        *({"latest": [3]}, {"acceleration": 0.0}, {"period": 0.0}, {"horizon": 0}),
     ],
     ts.make_osc_params: [
         {"stiffness": [1.0, 2.0]},
         {"damping_ratio": math.nan},
-        {"damping_ratio": 0.7, "damping": 9.0},
         {"axes": [1, 0, 1, 1, 1, 1]},
-        {"force_axes": AXIS, "axes": [True] * 6},
+        {"axes": [True]},
         {"posture_stiffness": [1.0] * 3},
-        {"effort_min": 1.0, "effort_max": 0.0},
         {"effort_limit": np.ones((2, 2)), "stiffness": np.ones((3, 6))},
         {"position_error_limit": -1.0},
         {"integral_gain": -1.0},
         {"integral_limit": math.nan, "integral_gain": 1.0},
         {"integral_limit": 1.0},
         {"limit_margin": -0.1},
-        {"limit_stiffness": [10.0, 20.0]},
-        *({name: "other"} for name in osc_params.TASK_CHOICES),
+        {"discretization": "other"},
     ],
     bp.step: [
         {
@@ -164,11 +159,11 @@ COMBINATIONS = {
     ],
     trajectories.minimum_jerk: [
         {"max_velocity": math.inf},
+        {"max_velocity": [1.0, -1.0]},
         {"dt": 10**400, "duration": 1.0},
         {"duration": None},
         {"duration": 1.0, "max_velocity": 1.0},
     ],
-    trajectories.trapezoidal: [{"max_velocity": [1.0, -1.0]}, {"max_acceleration": math.inf}],
     metrics.step_metrics: [
         {"measurement": np.zeros((1, 1, 2))},
         {"setpoint": np.zeros(3)},
@@ -227,7 +222,7 @@ def test_an_error_names_the_entry_and_its_value(function, changes, places, value
 MODULES = (bp, batchpid.export, ts, motors, friction, guard, metrics, trajectories)
 Y, TREE = np.zeros((1, 2)), planar()
 PARAMS = bp.make_params(2, 4.0, 1.0, 1.0)
-OSC = ts.make_osc_params(TREE, integral_gain=1.0)
+OSC = ts.make_osc_params(TREE, 0.01, integral_gain=1.0)
 POSE = ts.link_poses(TREE, Y, ["tip"])[:, 0]
 MOTORS, GUARD = (
     bp.make_actuators(2, lag=0.1, sensor_delay=0.01, backlash=0.1),
@@ -248,7 +243,7 @@ OWN = {
     "batchpid.task_space": {
         "params": OSC,
         "state": ts.init(OSC, Y),
-        "setpoint": POSE,
+        "inputs": ts.OSCInputs(POSE, Y, Y),
         "dynamics": ts.task_dynamics(TREE, Y, Y, "tip"),
     },
     "batchpid.metrics": {"setpoint": np.ones((9, 1, 2)), "measurement": np.zeros((9, 1, 2))},
@@ -270,7 +265,6 @@ WRONG = {
     "joint_names": [["a"], "ab", ["a", "a"], ["a", 2]],
     "params": [{"kp": 1}],
     "link": ["top", 3],
-    "frame": ["body"],
     "point": [0.1, [0.1], [0.1, 0.2]],
     "qpos": [np.zeros((1, 3)), "here"],
     "qvel": [np.zeros((1, 3))],
@@ -312,9 +306,6 @@ def needed(function, more=(), module=None):
     module = module or next(owner for owner, _, each in PUBLIC if each is function)
     values = VALUES | OWN.get(module, {}) | {"duration": 1.0, "dt": 0.01, "timestep": 0.01}
     values |= {"setpoint": np.ones((9, 1, 2))} if function is metrics.step_metrics else {}
-    values |= (
-        {"start": POSE[0], "target": POSE[0]} if function is trajectories.straight_line else {}
-    )
     values |= {"center": Y, "amplitude": Y, "frequency": 1.0, "period": 0.1, "horizon": 4}
     parameters = inspect.signature(function).parameters.items()
     required = {
