@@ -305,14 +305,12 @@ class EnvGroup:
 
     def _parts(self) -> Document:
         """Return the arrays outside engine and control that a snapshot holds: results of the last
-        tick, episodes of the motors' noise, the state of faults and pushes, and the digests of the
-        user's content.
+        tick, episodes of the motors' noise, and the state of faults and pushes.
         """
         return self._shown | {
             "episode": self._episode,
             "containment": self._faults.state,
             "pushes": self._pushes.counts,
-            "content": {"digest": self.pack.content} if self.pack.content.size else {},
         }
 
     def snapshot(self) -> dict[str, Rows]:
