@@ -33,16 +33,16 @@ if TYPE_CHECKING:
 RECORDED = {
     "setpoint": Quantity(np.float64, "setpoint", "rad|m"),
     "feedforward": Quantity(np.float64, "effort added before saturation", "N m|N"),
-    "changes": Quantity(np.uint8, "reset 1, restore 2, params 4, actuators 8", columns={}),
+    "changes": Quantity(np.uint8, "reset 1, restore 2, params 4", columns={}),
 } | QUANTITIES
 """Quantity of each array of a :class:`Rollout`, ``time`` aside."""
 OPTIONAL = ("feedforward", "changes")
 """Arrays of a :class:`Rollout` that may be None."""
 
 
-RESET, RESTORE, PARAMS, ACTUATORS = 1, 2, 4, 8
-"""Bits of :attr:`Rollout.changes`: the envs were reset, a snapshot was restored, params or
-actuators were assigned.
+RESET, RESTORE, PARAMS = 1, 2, 4
+"""Bits of :attr:`Rollout.changes`: the envs were reset, a snapshot was restored, params were
+assigned.
 """
 _OF_ROBOT = (
     "joint_names",
