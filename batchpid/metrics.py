@@ -66,7 +66,7 @@ class StepMetrics(NamedTuple):
     """Share of samples in saturation."""
 
     def __repr__(self) -> str:
-        return array_summary(self, "envs", "joints")
+        return array_summary(self)
 
     def worst(self) -> StepMetrics:
         """Return the worst case over envs, (joints,); undefined figures (NaN) are left out where

@@ -149,7 +149,7 @@ class Record(tuple[Any, ...]):
                 field.checked(f"{self.NAME}.{name}", values, joint_names, infinite=True)
 
     def __repr__(self) -> str:
-        return array_summary(self, "envs", "joints")
+        return array_summary(self)
 
 
 def with_fields(*fields: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
@@ -242,11 +242,18 @@ class LeafBuilder:
 
         ``size``, ``low`` and ``high`` name the options of both ends, the lower and the upper one.
         """
-        # Either the size or its ends: the check of both together follows.
         end = Field(neutral=math.inf, low=-math.inf)
-        fields = {size: end._replace(low=0.0), low: end, high: end}
-        read = {name: self.array(name, values.get(name), field) for name, field in fields.items()}
-        least, most = checked_ends(read, self.names)
+        extent = self.array(size, values.get(size), end._replace(low=0.0))
+        least, most = (self.array(name, values.get(name), end) for name in (low, high))
+        # Either the size or its ends.
+        if extent is not None:
+            if least is not None or most is not None:
+                problem = f"is given together with {low} or {high}"
+                remedy = "give the symmetric limit, or the two ends"
+                raise InvalidArgumentError(size, problem, remedy=remedy)
+            least, most = -extent, extent
+        elif not (least is None or most is None or is_traced(least) or is_traced(most)):
+            entries(low, least, least <= most, f"exceeds {high}", self.names)
         least = None if is_everywhere(least, -math.inf) else least
         return least, None if is_everywhere(most, math.inf) else most
 
@@ -282,28 +289,6 @@ class LeafBuilder:
         raise InvalidArgumentError(name, problem, remedy=remedy)
 
 
-def checked_ends(values: Mapping[str, Array], joint_names: Sequence[str] | None) -> Ends:
-    """Return the lower and the upper end of limits, None for no limit.
-
-    ``values`` are the size of both, the lower and the upper end, by the names of their arguments.
-
-    Raises InvalidArgumentError if the size is given with an end, or the lower end exceeds the upper
-    one.
-    """
-    size_name, low_name, high_name = values
-    size, low, high = values.values()
-    if size is not None:
-        if low is not None or high is not None:
-            problem = f"is given together with {low_name} or {high_name}"
-            remedy = "give the symmetric limit, or the two ends"
-            raise InvalidArgumentError(size_name, problem, remedy=remedy)
-        return -size, size
-    if low is not None and high is not None and not (is_traced(low) or is_traced(high)):
-        least, most = np.broadcast_arrays(low, high)
-        entries(low_name, least, least <= most, f"exceeds {high_name}", joint_names)
-    return low, high
-
-
 def frozen(record: R) -> R:
     """Return a record with read-only NumPy arrays, which later writes by the caller do not
     change.
@@ -334,23 +319,6 @@ def _can_be_written(leaf: Array) -> bool:
     return isinstance(leaf, np.ndarray) and (leaf.flags.writeable or not leaf.flags.owndata)
 
 
-def span(values: Array) -> str:
-    """Return the range of an array's entries, as in "40 to 87"; "3 of 12" for bools."""
-    if is_traced(values):
-        return "traced"
-    try:
-        array = np.asarray(values)
-        if array.dtype == bool:
-            return f"{array.sum()} of {array.size}"
-        # The range leaves NaN out; "nan" follows it.
-        present = array[~np.isnan(array)]
-        ends = [f"{end:.4g}" for end in (present.min(), present.max())] if present.size else []
-    except (TypeError, ValueError, RuntimeError):
-        return type(values).__name__
-    ranges = [" to ".join(dict.fromkeys(ends)), "nan" * (present.size < array.size)]
-    return " or ".join(filter(None, ranges)) or "empty"
-
-
 def summary(name: str, parts: Iterable[str]) -> str:
     """Return ``name(part, part, ...)``, on as many lines as needed."""
     return "\n".join(
@@ -363,19 +331,10 @@ def summary(name: str, parts: Iterable[str]) -> str:
     )
 
 
-def array_summary(arrays: Any, *axes: str) -> str:
-    """Return the type of a named tuple, the sizes of the ``axes`` of its arrays, and the range of
-    each.
-    """
+def array_summary(arrays: Any) -> str:
+    """Return the type of a named tuple, and the shapes of its arrays by name."""
     leaves = {name: leaf for name, leaf in arrays._asdict().items() if leaf is not None}
-    shapes = [leaf.shape for leaf in arrays if len(getattr(leaf, "shape", ())) == len(axes)]
-    # The largest size of each axis, as in "64 envs" and "1 joint".
-    largest = (max(lengths) for lengths in zip(*shapes, strict=True))
-    sizes = [
-        f"{n} {axis[: None if n != 1 else -1]}" for n, axis in zip(largest, axes, strict=False)
+    shapes = [
+        f"{name} {getattr(leaf, 'shape', type(leaf).__name__)}" for name, leaf in leaves.items()
     ]
-    ranges = [
-        f"{name} {type(leaf).__name__ if isinstance(leaf, tuple) else span(leaf)}"
-        for name, leaf in leaves.items()
-    ]
-    return summary(type(arrays).__name__, [*sizes, *ranges])
+    return summary(type(arrays).__name__, shapes)

@@ -104,7 +104,7 @@ class OSCParams(NamedTuple):
     """
 
     def __repr__(self) -> str:
-        return array_summary(self, "envs", "axes")
+        return array_summary(self)
 
 
 @with_fields(*OSC_FIELDS)

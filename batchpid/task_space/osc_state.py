@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import exported
-from batchpid.arrays.records import array_summary
 from batchpid.task_space.rigid_tree import RigidTree
 
 
@@ -36,9 +35,6 @@ class OSCInputs(NamedTuple):
     """Wrench of the tool on its surroundings (envs, 6) [N, N m], in these axes."""
     feedforward: Array = None
     """Effort added (envs, dof), such as the effort of viscous damping [N m or N]."""
-
-    def __repr__(self) -> str:
-        return array_summary(self, "envs", "columns")
 
 
 class TaskDynamics(NamedTuple):
@@ -70,9 +66,6 @@ class OSCState(NamedTuple):
     """I (envs, 6): acceleration of the task [m/s^2, rad/s^2]. None without
     ``integral_gain``."""
 
-    def __repr__(self) -> str:
-        return array_summary(self, "envs", "joints")
-
 
 class OSCTerms(NamedTuple):
     """Terms of one step."""
@@ -97,6 +90,3 @@ class OSCTerms(NamedTuple):
     """Bool (envs,): an eigenvalue of A is below s0, so that some direction has lost stiffness; True
     for NaN.
     """
-
-    def __repr__(self) -> str:
-        return array_summary(self, "envs", "joints")
