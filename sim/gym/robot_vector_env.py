@@ -40,7 +40,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
     """Task of N robots: a :class:`gymnasium.vector.VectorEnv` over the Runner. A task is a subclass
     with hooks.
 
-    This class has the spaces, seeds, episodes, autoreset, send and recv, faults and randomization.
+    This class has the spaces, seeds, episodes, autoreset, faults and randomization.
     The hooks define the task, in the order of a step. All but :meth:`spaces`, :meth:`observe` and
     :meth:`reward` have a default:
 
@@ -367,7 +367,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
                 first["setpoint_rate"] = np.where(begins[:, None], 0.0, rate)
         else:
             first, *self._later = self._chunks(rows, setpoints)
-        self.runner.send(**first)
+        self._first = first
         self.action = rows[self._ticks - 1]
         self.setpoint = setpoint
         self._is_stepping = True
@@ -399,7 +399,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         """
         if not self._is_stepping:
             raise CallOrderError("step_wait: no step is under way; call step_async(actions) first")
-        observed = self.runner.recv()
+        observed = self.runner.step(**self._first)
         while self._later:
             observed = self.runner.step(**self._later.pop(0))
         # From here on the step has ended, even if a hook of the task raises.

@@ -132,8 +132,7 @@ class Recorder(SingleOwner):
     def close(self, complete: bool = True) -> None:
         """Write the remaining rows and close the file. May be called again, as after an interrupt.
 
-        ``complete`` says whether the recording has all ticks of its run; it has not after a
-        ``send`` without its ``recv``.
+        ``complete`` says whether the recording has all ticks of its run.
 
         Raises
         ------
@@ -151,7 +150,7 @@ class Recorder(SingleOwner):
                 if self._file:  # not closed yet
                     info = replace(
                         self._info,
-                        complete=complete and not self._runner._sent,
+                        complete=complete,
                         faults=self._runner.faults,
                         rates=self._rates,
                     )

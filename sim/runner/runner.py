@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.arrays.array_types import Float64, Progress
 from batchpid.checks import check_keywords, choice, instance
-from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError, SingleOwner, warn
+from batchpid.errors import ClosedError, InvalidArgumentError, SingleOwner, warn
 from batchpid.io.files import package_versions
 from batchpid.sim.diagnosis.loop_stability import StabilityCheck
 from batchpid.sim.findings import report_shortfalls
@@ -125,8 +125,6 @@ class Runner(SingleOwner):
         """Recorder of every tick; :class:`batchpid.sim.Recorder` sets it."""
         self._call = OneCall()
         self._state = RunnerState.first(checked)
-        self._sent: Request | None = None  # by send(), until recv()
-        self._is_running = False  # whether the workers run it
         self._cause: BaseException | None = None  # of the end
         self._has_warned = False  # of a fault
         self._stability: StabilityCheck | None = None
@@ -204,12 +202,6 @@ class Runner(SingleOwner):
         base_twist
             Velocity of that link's origin and its angular velocity, along the axes of the world,
             (6,) or (envs, 6) [m/s, rad/s]; default 0.
-
-        Raises
-        ------
-        CallOrderError
-            The observation of a tick that was sent has not been received, as for :meth:`step`,
-            :meth:`rollout` and :meth:`restore`.
         """
         self._ready()
         base = {"base_pose": base_pose, "base_twist": base_twist}
@@ -267,67 +259,10 @@ class Runner(SingleOwner):
         substeps
             Sim steps of this tick; default the runner's.
         """
-        if self._sent is not None or self._pool.closed:
+        if self._pool.closed:
             self._ready()
         command = setpoint, setpoint_rate, setpoint_acceleration, feedforward
         self._execute(self._tick(command, latency, substeps))
-        return self._observed()
-
-    def send(
-        self,
-        setpoint: ArrayLike | None,
-        *,
-        setpoint_rate: ArrayLike | None = None,
-        setpoint_acceleration: ArrayLike | None = None,
-        feedforward: ArrayLike | None = None,
-        latency: ArrayLike = 0.0,
-        substeps: int | None = None,
-    ) -> None:
-        """Begin a tick and return, while the workers run it; :meth:`recv` returns its observation.
-
-        The two are bit-identical to one :meth:`step`, and take its arguments. In between,
-        :attr:`time`, :attr:`faults` and the like are those of the tick before; :attr:`info`,
-        assignments, and all methods but :meth:`recv` and :meth:`close` raise CallOrderError. With
-        ``workers=0`` the tick runs in this call.
-
-        Raises
-        ------
-        CallOrderError
-            The observation of the last tick that was sent has not been received.
-        """
-        self._ready()
-        command = setpoint, setpoint_rate, setpoint_acceleration, feedforward
-        run = self._tick(command, latency, substeps)
-        self._prepare(run)
-        self._call.begin()
-        try:
-            self._call.waits = True
-            self._pool.begin(run)
-            self._sent = run
-            self._is_running = True
-        except BaseException as error:
-            self._fail(error)
-            raise
-        finally:
-            if self._pool.closed:
-                self._pool.close()
-            self._call.end()
-
-    def recv(self) -> Observation:
-        """Wait for the end of the tick that :meth:`send` began; return its observation. After an
-        interrupt it can be called again.
-
-        Raises
-        ------
-        CallOrderError
-            No tick was sent since the last call.
-        """
-        self._check_open()
-        if self._sent is None:
-            raise CallOrderError("no tick was sent; call send(setpoint) first")
-        if self._is_running:
-            self._execute(self._sent)
-        self._sent = None
         return self._observed()
 
     def rollout(
@@ -413,7 +348,7 @@ class Runner(SingleOwner):
         # A signal handler may have closed the runner after the tick.
         present: Any = getattr(self._pool, "present", None)
         if present is None:
-            self._check_open()
+            self._ready()
         return self._with_tool(present.observation.map(COPY))
 
     def _with_tool(self, seen: Observation) -> Observation:
@@ -650,19 +585,6 @@ class Runner(SingleOwner):
     # -------------------------------------------------------------------------------------
 
     def _ready(self) -> None:
-        """Check that no tick was sent, and as :meth:`_check_open`.
-
-        Raises
-        ------
-        CallOrderError
-            The observation of a tick that was sent has not been received.
-        """
-        self._check_open()
-        if self._sent is not None:
-            problem = "the observation of the last tick has not been received"
-            raise CallOrderError(f"{problem}; call recv() first")
-
-    def _check_open(self) -> None:
         """Check that the runner can be used.
 
         Raises
@@ -740,25 +662,22 @@ class Runner(SingleOwner):
             self._execute(Request("add_chunk", (chunk, latency)))
 
     def _execute(self, request: Request) -> Outcome:
-        """Execute a request, or complete the one that was sent; then issue warnings.
+        """Execute a request, then issue warnings.
 
         Ctrl-C does not interrupt it between the request and the new state. The runner is closed if
         the workers cannot complete the request, or if a second Ctrl-C ends it.
         """
         call = self._call
         pool = self._pool
-        is_sent = self._is_running
         is_run = request.method == "run"
-        if not is_sent:
-            self._prepare(request)
+        self._prepare(request)
         # From here on Ctrl-C waits, so that workers and state change together or not at all.
         call.begin()
         try:
             call.waits, before = True, self._state
-            if not is_sent:
-                pool.begin(request)
+            pool.begin(request)
             outcome = pool.finish()
-            call.waits = self._is_running = False
+            call.waits = False
             # Ticks before a failure count: the workers have run them.
             if outcome.failure is None or is_run:
                 self._state = committed(self.options, before, outcome)

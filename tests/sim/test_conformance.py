@@ -459,18 +459,15 @@ def overwrite(arrays):
 
 
 def tick_by_tick(case):
-    """Single ticks, by step and by send and recv in turn, are bit-identical to a rollout; arrays of
-    the caller are overwritten after each call.
+    """Single ticks are bit-identical to a rollout; arrays of the caller are overwritten after each
+    call.
     """
 
     def rollout(runner, given):
         seen = []
         for tick in range(len(given["setpoints"])):
             row = {name.removesuffix("s"): rows[tick] for name, rows in given.items()}
-            if tick % 2:
-                runner.send(**row)
-                overwrite(row)
-            seen.append(runner.recv() if tick % 2 else runner.step(**row))
+            seen.append(runner.step(**row))
             overwrite(row)
         return type(seen[0]).join([each.map(lambda rows: rows[None]) for each in seen])
 

@@ -37,11 +37,6 @@ def make(workers, **options):
     )
 
 
-def exchange(runner, setpoints):
-    runner.send(setpoints[0])
-    return runner.recv()
-
-
 def change_params(runner, setpoints):
     runner.params = ROBOT.params(kp=20.0 + 10 * abs(setpoints[0, 0, 0]))
     return runner.observe()
@@ -57,7 +52,6 @@ COMMANDS = {
     "step": lambda runner, setpoints: runner.step(
         setpoints[0], feedforward=setpoints[1], substeps=7
     ),
-    "exchange": exchange,
     "rollout": lambda runner, setpoints: runner.rollout(setpoints).observation,
     "reset": lambda runner, setpoints: runner.reset(NEAR, mask=setpoints[0, :, 0] > 0),
     "change params": change_params,
@@ -235,11 +229,10 @@ def test_a_forked_child_does_not_keep_the_workers_of_a_killed_caller():
         os.kill(child, signal.SIGKILL)
 
 
-def test_closing_does_not_wait_for_a_worker_that_is_stopped_in_a_tick():
+def test_closing_does_not_wait_for_a_worker_that_is_stopped():
     # The time limit of a test is shorter than that of the request.
     with Runner(ROBOT, N, workers=2, timeout=3600.0) as runner:
         send(runner.pids[0], signal.SIGSTOP)
-        runner.send(NEAR)
 
 
 def test_a_worker_without_an_answer_is_stuck_after_the_timeout(capfd, monkeypatch):

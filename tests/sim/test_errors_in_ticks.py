@@ -60,11 +60,7 @@ def run(runner, way):
     if way == "rollout":
         runner.rollout(np.broadcast_to(MARKS, (TICKS, *MARKS.shape)))
     for _ in range(TICKS):
-        if way == "step":
-            runner.step(MARKS)
-        else:
-            runner.send(MARKS)
-            runner.recv()
+        runner.step(MARKS)
 
 
 def outcome(workers, controller, way="rollout", **options):
@@ -99,7 +95,7 @@ def assert_same(first, second):
         max_size=3,
     ),
     kind=st.sampled_from(["raises", "raises an error of ours", "wrong shape", "no pair"]),
-    way=st.sampled_from(["rollout", "step", "send"]),
+    way=st.sampled_from(["rollout", "step"]),
 )
 def test_any_number_of_workers_ends_in_the_same_error_and_state(workers, failures, kind, way):
     controller = FailsLater(sorted(failures), kind)

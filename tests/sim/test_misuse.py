@@ -12,7 +12,7 @@ from identical import assert_identical
 from option_values import ARM
 from processes import handler, have_ended
 
-from batchpid.errors import CallOrderError, ClosedError, InUseError, InvalidArgumentError
+from batchpid.errors import ClosedError, InUseError
 from batchpid.sim import Runner
 
 N, LONG = 4, 100_000
@@ -28,35 +28,6 @@ def make(workers=0):
 def runner(request):
     with make(request.param) as made:
         yield made
-
-
-def test_calls_out_of_order_are_named(runner):
-    snapshot = runner.snapshot()
-    with pytest.raises(CallOrderError, match="send"):
-        runner.recv()
-    with pytest.raises(InvalidArgumentError, match="setpoint"):
-        runner.send(np.nan)
-    runner.send(TABLE[0])
-    time = runner.time
-    others = {"step": (TABLE[1],), "reset": (TABLE[2],)}
-    others |= {"rollout": (TABLE[:3],), "restore": (snapshot,), "send": (TABLE[1],)}
-    for name, arguments in (others | {"observe": (), "snapshot": (), "poses": ()}).items():
-        with pytest.raises(CallOrderError, match="recv"):
-            getattr(runner, name)(*arguments)
-    with pytest.raises(CallOrderError, match="recv"):
-        runner.params = PARAMS
-    assert runner.time == time
-    with make() as model:
-        assert_identical(runner.recv(), model.step(TABLE[0]))
-    with pytest.raises(CallOrderError, match="send"):
-        runner.recv()
-    runner.send(TABLE[0])
-    pids, before = runner.pids, len(os.listdir("/proc/self/fd"))
-    runner.close()
-    assert have_ended(pids)
-    assert len(os.listdir("/proc/self/fd")) < before
-    with pytest.raises(ClosedError):
-        runner.recv()
 
 
 # -- threads, signal handlers, children

@@ -149,7 +149,6 @@ def test_a_call_with_any_value_changes_nothing_if_it_is_refused(contain):
     with Runner(ARM, N, workers=0, substeps=2, params=PARAMS, **options) as runner:
         calls = {
             "step": command,
-            "send": command,
             "rollout": table,
             "reset": {"qpos": ROW, "qvel": ROW, "mask": np.ones(N, bool), "seed": None},
             "restore": {"snapshot": None},
@@ -175,8 +174,6 @@ def act(runner, name, arguments):
         setattr(runner, *arguments.popitem())
         return
     method(**arguments)
-    if name == "send":
-        runner.recv()
 
 
 def is_refused(runner, call, name):

@@ -97,8 +97,7 @@ def test_every_change_of_the_state_is_recorded_before_its_tick(tmp_path):
             for change, codes in CHANGES.items():
                 runner.rollout(table(2))
                 change(runner)
-                runner.send(ROBOT.start)
-                runner.recv()
+                runner.step(ROBOT.start)
                 expected += [[0] * N, [0] * N, codes]
             assert runner.rollout(table(1)).changes is None
             # Several changes at once.
@@ -125,9 +124,8 @@ def test_ticks_of_another_length_are_refused_while_it_records(tmp_path):
     with make() as runner:
         with Recorder(tmp_path / "run.h5", runner):
             runner.step(ROBOT.start, substeps=2)
-            for call in (runner.step, runner.send):
-                with pytest.raises(InvalidArgumentError, match="substeps: is not the runner's 2"):
-                    call(ROBOT.start, substeps=20)
+            with pytest.raises(InvalidArgumentError, match="substeps: is not the runner's 2"):
+                runner.step(ROBOT.start, substeps=20)
         runner.step(ROBOT.start, substeps=20)
     np.testing.assert_allclose(read_recording(tmp_path / "run.h5").time, [0.001])
 
@@ -271,10 +269,3 @@ def test_commands_refuse_an_empty_recording(words, tmp_path, capsys):
         pass
     assert main([*words, str(tmp_path / "empty.h5")]) == 2
     assert "holds no tick" in capsys.readouterr().err
-
-
-def test_a_tick_that_is_not_received_leaves_an_incomplete_recording(tmp_path):
-    with make() as runner, Recorder(tmp_path / "run.h5", runner):
-        runner.step(ROBOT.start)
-        runner.send(ROBOT.start)
-    assert not read_recording(tmp_path / "run.h5").info.complete

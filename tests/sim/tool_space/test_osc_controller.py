@@ -201,8 +201,7 @@ def test_the_pose_of_the_tool_is_observed(panda):
     with Runner(panda, 2, control=control, **OPTIONS) as runner:
         first = runner.reset()
         rollout = runner.rollout(goals)
-        runner.send(goals[0])
-        last = runner.recv()
+        last = runner.step(goals[0])
     for seen in (first, last, rollout):
         wanted = ts.link_poses(panda.kinematic_tree(), seen.qpos, [HAND], point=point)[..., 0, :]
         np.testing.assert_array_equal(seen.tool_pose, wanted.astype(np.float32))
