@@ -23,7 +23,7 @@ from typing import Any, ClassVar, ParamSpec, TypeVar
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Document, DType, Rows
-from batchpid.arrays.elementwise import NAMED_TUPLES, namespace
+from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.field_tables import Field
 from batchpid.arrays.trees import mapped, parts
 from batchpid.checks import (
@@ -41,6 +41,8 @@ P = ParamSpec("P")
 R = TypeVar("R", bound="Record")
 T = TypeVar("T")
 MOST_JOINTS = 100_000
+ANY_NUMBER = Field(neutral=math.inf, low=-math.inf)
+"""Field of any number but NaN."""
 LINE_WIDTH = 130
 """Longest line of a representation."""
 Ends = tuple[Array, Array]
@@ -57,9 +59,6 @@ class Record(tuple[Any, ...]):
     """Declared fields of numbers, by name."""
     WHOLE: ClassVar[tuple[str, ...]] = ()
     """Leaves with one value for all joints."""
-
-    def __init_subclass__(cls) -> None:
-        NAMED_TUPLES.append(cls)
 
     def options(self) -> Document:
         """Return the options that are on, as arguments of the constructor that build this record
@@ -128,25 +127,18 @@ class Record(tuple[Any, ...]):
 
         A leaf without a declared field may hold any numbers.
         """
-        if joint_names is None:
-            joints = self.num_joints
-        else:
-            joints = len(joint_names)
-        shapes = (1, joints), (num_envs, joints)
+        joints = self.num_joints if joint_names is None else len(joint_names)
         for name, leaf in self.leaves().items():
             if name in self.WHOLE:
                 continue
-            if leaf.shape not in shapes:
-                problem = f"has shape {leaf.shape}, not {shapes[0]} or {shapes[1]}"
-                remedy = "give one row, or one row per env"
-                raise InvalidArgumentError(f"{self.NAME}.{name}", problem, remedy=remedy)
-            if leaf.dtype != self.dtype:
-                problem = f"is {leaf.dtype}, another one is {self.dtype}"
-                raise InvalidArgumentError(f"{self.NAME}.{name}", problem, remedy="use one dtype")
+            argument = f"{self.NAME}.{name}"
+            if leaf.dtype != self.dtype or leaf.shape not in ((1, joints), (num_envs, joints)):
+                problem = f"is {leaf.dtype} {leaf.shape}, not {self.dtype} ({num_envs}, {joints})"
+                remedy = "give one row, or one row per env, of one dtype"
+                raise InvalidArgumentError(argument, problem, remedy=remedy)
             if not is_traced(leaf):
-                field = self.FIELDS.get(name, Field(low=-math.inf))
-                values = np.asarray(leaf)
-                field.checked(f"{self.NAME}.{name}", values, joint_names, infinite=True)
+                field = self.FIELDS.get(name, ANY_NUMBER)
+                field.checked(argument, np.asarray(leaf), joint_names)
 
     def __repr__(self) -> str:
         return array_summary(self)
@@ -242,9 +234,8 @@ class LeafBuilder:
 
         ``size``, ``low`` and ``high`` name the options of both ends, the lower and the upper one.
         """
-        end = Field(neutral=math.inf, low=-math.inf)
-        extent = self.array(size, values.get(size), end._replace(low=0.0))
-        least, most = (self.array(name, values.get(name), end) for name in (low, high))
+        extent = self.array(size, values.get(size), ANY_NUMBER._replace(low=0.0))
+        least, most = (self.array(name, values.get(name), ANY_NUMBER) for name in (low, high))
         # Either the size or its ends.
         if extent is not None:
             if least is not None or most is not None:
@@ -293,13 +284,10 @@ def frozen(record: R) -> R:
     """Return a record with read-only NumPy arrays, which later writes by the caller do not
     change.
 
-    Writeable arrays and views are copied. If all arrays are read-only, ``record`` itself is
-    returned.
     """
-    # Most records are frozen already, and cost one look.
-    if not any(map(_can_be_written, record)):
-        return record
-    copied: R = mapped(lambda leaf: frozen_array(leaf) if _can_be_written(leaf) else leaf, record)
+    copied: R = mapped(
+        lambda leaf: frozen_array(leaf) if isinstance(leaf, np.ndarray) else leaf, record
+    )
     return copied
 
 
@@ -313,10 +301,6 @@ def frozen_array(array: Array, dtype: DType = None) -> Array:
 def is_everywhere(array: Array, value: float | bool | str) -> bool:
     """Return whether an array is left out, or known to be ``value`` in all entries."""
     return array is None or (not is_traced(array) and bool((array == value).all()))
-
-
-def _can_be_written(leaf: Array) -> bool:
-    return isinstance(leaf, np.ndarray) and (leaf.flags.writeable or not leaf.flags.owndata)
 
 
 def summary(name: str, parts: Iterable[str]) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from batchpid.arrays.array_types import Array
-from batchpid.arrays.elementwise import exported
 from batchpid.task_space.rigid_tree import RigidTree
 
 
@@ -56,7 +55,6 @@ class TaskDynamics(NamedTuple):
     """1.0 for the joints between the base and the tool, else 0.0 (dof,)."""
 
 
-@exported
 class OSCState(NamedTuple):
     """State of the law."""
 
