@@ -134,11 +134,6 @@ class Friction(Stage):
         state, qf = model.advance(self.friction, state, values.outputs.qf, qvel)
         return _kept(state), values.told(qf=qf)
 
-    def adopt(self, before: Self, state: model.FrictionState, values: Values) -> Any:
-        if (state.effort is None) == (self.friction.coulomb is None):
-            return state
-        return self.init(values)[0]
-
 
 def _with_inertia(state: model.FrictionState, values: Values) -> model.FrictionState:
     gain, memory = values.inertia

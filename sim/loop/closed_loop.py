@@ -64,7 +64,7 @@ class LoopObservation(NamedTuple):
     """None without guard."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ClosedLoop:
     """A plant under the control of a Runner: :func:`closed_loop`.
 
@@ -75,11 +75,6 @@ class ClosedLoop:
     control: Control
     tree: RigidTree
     start: Array
-
-    def __repr__(self) -> str:
-        control = self.control
-        sizes = f"{control.envs} envs, {len(self.start)} joints"
-        return f"ClosedLoop({type(self.plant).__name__}, {sizes}, timestep={control.timestep:g})"
 
     def changed(
         self,
