@@ -132,20 +132,16 @@ def minimum_jerk(
 
 def _move(start: ArrayLike, target: ArrayLike) -> tuple[Float64, Float64]:
     """Return the start and the move (..., joints) of a move."""
-    shapes = [
-        read_array(name, value).shape for name, value in (("start", start), ("target", target))
-    ]
-    try:
-        shape = np.broadcast_shapes(*shapes)
-    except ValueError:
-        shape = ()
+    x0, x1 = read_array("start", start), read_array("target", target)
+    # Either may be one row for all envs.
+    shape = max(x0.shape, x1.shape, key=lambda shape: (len(shape), shape))
     if not 1 <= len(shape) <= 2 or 0 in shape:
-        problem = f"has shape {shapes[1]} and start {shapes[0]}"
+        problem = f"has shape {x1.shape}, and start {x0.shape}"
         remedy = "give each as (joints,) or (envs, joints), with the same joints"
         raise InvalidArgumentError("target", problem, remedy=remedy)
     x0, x1 = (
-        at_least(n, broadcast(n, x, shape), -math.inf)
-        for n, x in (("start", start), ("target", target))
+        at_least(name, broadcast(name, x, shape), -math.inf)
+        for name, x in (("start", x0), ("target", x1))
     )
     return x0, x1 - x0
 
