@@ -115,10 +115,7 @@ class Playback:
             raise InvalidArgumentError("rollout", problem, remedy=remedy)
         self.robot = robot
         self.num_envs = integer("num_envs", rollout.num_envs, 1, MAX_ROBOTS)
-        ground = rollout.info.ground
-        if ground is None:
-            ground = robot.has_ground
-        self.ground = ground
+        self.ground = bool(rollout.info.ground)
         """True if the run had a ground at height 0."""
         self._rollout = rollout
         self.duration = float(rollout.time[-1] - rollout.time[0])
