@@ -20,7 +20,7 @@ from batchpid.sim.robot.robot_options import content
 from batchpid.sim.view.view_data import recorded_robot
 
 pytest.importorskip("viser")
-SHORT = ("--num-envs", 1, "--workers", 0, "--port", 18300)
+SHORT = ("--num-envs", 1, "--workers", 0, "--port", 0)
 
 
 def write(path, robot=None, envs=1, name="panda"):
