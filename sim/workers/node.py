@@ -59,11 +59,11 @@ class Node:
                 error = WorkerLost(str(error.__cause__))
             return failed(error).portable("node"), None
         self._pool.replay.start_from(None)
-        arrays = None
-        if outcome.num_ticks:
-            arrays = self._pool.arrays.at(slice(outcome.num_ticks))
         if outcome.failure is not None:
-            return outcome.failure, arrays
+            return outcome.failure, None
+        arrays = None
+        if request.ticks:
+            arrays = self._pool.arrays.at(slice(request.ticks))
         return outcome.result, arrays
 
 
