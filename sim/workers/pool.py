@@ -235,10 +235,6 @@ class WorkerPool(SingleOwner):
             vars(self).pop(name, None)
         self._shared.close()
 
-    def __del__(self) -> None:
-        if hasattr(self, "workers"):
-            self.close()
-
     def _raise_if_closed(self, error: Exception) -> None:
         if self.closed:
             raise ClosedError(_CLOSED) from error
