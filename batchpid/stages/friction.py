@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from batchpid.arrays.array_types import Array
-from batchpid.arrays.elementwise import exported, namespace, replace_envs
+from batchpid.arrays.elementwise import namespace, replace_envs
 from batchpid.motors import friction as model
 from batchpid.motors.coupling import Coupling
 from batchpid.stages.control import Control
@@ -19,7 +19,6 @@ REFRESH_STEPS = 64
 """Sim steps of an env between updates of the friction model's inertia."""
 
 
-@exported
 class InertiaState(NamedTuple):
     """State of :class:`Inertia`."""
 

@@ -13,7 +13,7 @@ import numpy as np
 
 import batchpid as bp
 from batchpid.arrays.array_types import Array, Pytree
-from batchpid.arrays.elementwise import exported, namespace, replace_envs
+from batchpid.arrays.elementwise import namespace, replace_envs
 from batchpid.checks import check_keywords
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.scene_spec import added_friction, own_friction
@@ -44,7 +44,6 @@ class Plant(Protocol):
         """
 
 
-@exported
 class LoopState(NamedTuple):
     """State of a closed loop, a tree of arrays (envs, ...)."""
 
@@ -54,7 +53,6 @@ class LoopState(NamedTuple):
     """Number of the episode of each env (envs,), on which the noise of sensors depends."""
 
 
-@exported
 class LoopObservation(NamedTuple):
     """Robots after a tick, arrays (envs, dof) as in :class:`batchpid.sim.Observation`."""
 
