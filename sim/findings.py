@@ -65,7 +65,7 @@ OF_FILES = (
          "without the shape; the convex hull of the mesh collides"),
     FindingKind("missing-mesh", "warning",
          "a mesh that is not there or cannot be read",
-         "without the shape; `missing_meshes=\"error\"` refuses"),
+         "without the shape"),
     FindingKind("self-collision", "warning",
          "a pair in the .srdf that does not name two links of the robot",
          "without the pair"),

@@ -78,8 +78,8 @@ def merge_links(tables: Tables, separate: Separate = ()) -> Tables:
             )
         )
     row = {body.name: index for index, body in enumerate(bodies)}
-    # Engines number shapes by body, and SAPIEN builds mirrored ones last.
-    shapes.sort(key=lambda shape: (row[shape.body], shape.is_mirrored))
+    # Engines number shapes by body.
+    shapes.sort(key=lambda shape: row[shape.body])
     return Tables(tuple(bodies), tuple(shapes), links)
 
 

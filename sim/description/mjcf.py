@@ -2,15 +2,13 @@
 pose.
 
 Geoms that add neither shape nor mass are not compiled, so their meshes and textures may be missing.
-A collision mesh may be missing if the mass of its body does not depend on it.
 """
 
 from __future__ import annotations
 
-import math
 import sys
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -73,19 +71,18 @@ def read_mjcf(
     name: str,
     findings: list[Finding],
     fixed_base: bool | None,
-    missing_meshes: str,
 ) -> Source:
     """Return the content of the MJCF file at ``path`` as the robot ``name``, with ``findings`` of
     reading the file.
 
     For the other arguments see :meth:`batchpid.sim.Robot.load`. Raises RobotError if MuJoCo refuses
-    the file, it has a ball joint or several robots, or missing meshes are refused.
+    the file, or it has a ball joint or several robots.
     """
     # MuJoCo opens the file by its path, and workers do so again.
     if not path.is_file():
         raise RobotError(f"{path}: an MJCF file is read several times; save it as a file first")
     try:
-        return _read(path, name, findings, fixed_base, missing_meshes)
+        return _read(path, name, findings, fixed_base)
     except UnicodeDecodeError as error:
         raise RobotError(
             f"{path}: a name is not UTF-8, which MuJoCo requires: {error}; save it as UTF-8"
@@ -97,9 +94,8 @@ def _read(
     name: str,
     findings: list[Finding],
     fixed_base: bool | None,
-    missing_meshes: str,
 ) -> Source:
-    compiled = compile_file(path, missing_meshes, findings)
+    compiled = compile_scene(path)
     model = compiled.model
     robot = RobotInFile(model, path, findings)
     # A base is free where the file has a free joint, unless the caller fixes it.
@@ -172,7 +168,6 @@ def _file(
     floats = any(robot.is_of_robot(body) for body in free)
     return MjcfFile(
         path=str(path),
-        is_whole=compiled.is_whole,
         content=compiled.content,
         bodies=tuple(robot.bodies.values()),
         falling=tuple(robot.bodies[body] for body in free if not robot.is_of_robot(body)),
@@ -234,121 +229,35 @@ def _report_unused(robot: RobotInFile) -> None:
 
 
 class Compiled(NamedTuple):
-    """Model of a file, and the ``mujoco.MjSpec`` that was compiled.
-
-    ``is_whole`` says whether it has the geoms that are only drawn, ``missing`` are the files of
-    collision meshes that it is without.
-    """
+    """Model of a file, and the ``mujoco.MjSpec`` that was compiled."""
 
     scene: MjSpec
     model: MjModel
-    is_whole: bool
-    missing: tuple[str, ...]
 
     @property
     def content(self) -> str:
         """Digest of the elements that move, collide or act."""
         model = self.model
         names = [name for name in dir(model) if name.startswith(_PREFIXES)]
-        arrays = {name: _rounded(np.asarray(getattr(model, name), float)) for name in names}
+        # The last bits may differ between kinds of processors.
+        arrays = {name: np.round(np.asarray(getattr(model, name), float), 9) for name in names}
         return digest(arrays, model.names, str(model.opt))
 
 
-def _rounded(values: Float64) -> Float64:
-    """Return ``values`` to nine digits: the last bits may differ between kinds of processors."""
-    # What cancels out leaves a rest of rounding.
-    shares, exponents = np.frexp(np.where(np.abs(values) < 1e-12, 0.0, values))
-    rounded: Float64 = np.ldexp(np.round(shares, 9), exponents)
-    return rounded
-
-
-def compile_file(path: Path, missing_meshes: str, findings: list[Finding]) -> Compiled:
-    """Return the compiled model of a file.
-
-    Raises RobotError if MuJoCo refuses the file, or missing meshes are refused.
-    """
-    lean = None
-    try:
-        lean = compile_scene(path, is_whole=False)
-        if not lean.missing:
-            return lean
-        return compile_scene(path, is_whole=True)
-    except RobotError:
-        # Something may refer to a geom that is only drawn.
-        if lean is None:
-            return compile_scene(path, is_whole=True)
-        if missing_meshes == "error":
-            raise
-    text = f"collision meshes not found, simulated without: {', '.join(lean.missing)}"
-    remedy = "put the files where the MJCF names them"
-    findings.append(Finding("missing-mesh", text, remedy))
-    return lean
-
-
-def compile_scene(path: Path, is_whole: bool) -> Compiled:
-    """Return the compilation of the whole file, or of its collision shapes and masses.
+def compile_scene(path: Path) -> Compiled:
+    """Return the compilation of a file, without elements that are only drawn.
 
     Raises RobotError if MuJoCo refuses it.
     """
-    missing: tuple[str, ...] = ()
     # MuJoCo takes a file of the same name, size and second for the one that it has read.
     mujoco.mj_clearCache(mujoco.mj_getCache())
     try:
         scene = mujoco.MjSpec.from_file(str(path))
-        if not is_whole:
-            missing = _strip(scene, path)
-        return Compiled(scene, scene.compile(), is_whole, missing)
+        scene.compiler.discardvisual = True
+        return Compiled(scene, scene.compile())
     except (ValueError, mujoco.FatalError) as error:
         problem = " ".join(str(error).split())
         raise RobotError(
             f"{path}: MuJoCo cannot compile the file: {problem}; correct it, or restore the file"
             " that it names, e.g. by git lfs pull"
         ) from error
-
-
-def _strip(spec: Any, path: Path) -> tuple[str, ...]:
-    """Remove materials, geoms that add neither shape nor mass, and collision shapes of missing
-    meshes; return the files of the latter.
-    """
-    # A <pair> makes geoms collide whatever their masks say.
-    paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
-    absent = {}
-    for mesh in spec.meshes:
-        folder = path.parent / (mesh.compiler.meshdir or "")
-        file = Path(mesh.file).name if spec.strippath else mesh.file
-        if mesh.file and not (folder / file).is_file():
-            absent[mesh.name] = mesh.file
-    missing: dict[str, None] = {}
-    used: set[str] = set()
-    for geom in list(spec.geoms):
-        # A texture that is missing would stop the compilation.
-        geom.material = ""
-        is_solid = geom.contype or geom.conaffinity or geom.name in paired
-        # A missing mesh that weighs stays, and MuJoCo refuses it.
-        if _weighs(spec, geom) or (is_solid and geom.meshname not in absent):
-            used.add(geom.meshname)
-            continue
-        if is_solid:
-            missing[absent[geom.meshname]] = None
-        for pair in list(spec.pairs):
-            if geom.name in (pair.geomname1, pair.geomname2):
-                spec.delete(pair)
-        spec.delete(geom)
-    for site in spec.sites:
-        site.material = ""
-    unused = [mesh for mesh in spec.meshes if mesh.name not in used]
-    for element in [*spec.materials, *spec.textures, *unused]:
-        spec.delete(element)
-    return tuple(missing)
-
-
-def _weighs(spec: Any, geom: Any) -> bool:
-    """Return whether the mass of a geom's body depends on the geom."""
-    body = geom.parent
-    always = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
-    if body.explicitinertial and spec.compiler.inertiafromgeom != always:
-        return False
-    if geom.mass == 0 or (math.isnan(geom.mass) and geom.density == 0):
-        return False
-    low, high = spec.compiler.inertiagrouprange
-    return bool(low <= geom.group <= high) and body.parent is not None

@@ -45,39 +45,26 @@ def find_robot(name_or_path: str | Path) -> Path:
     )
 
 
-def read_robot(
-    path: Path,
-    fixed_base: bool | None,
-    package_dirs: tuple[Path, ...],
-    missing_meshes: str,
-) -> Source:
+def read_robot(path: Path, fixed_base: bool | None, package_dirs: tuple[Path, ...]) -> Source:
     """Return the robot in the URDF or MJCF file at ``path``, without its .srdf.
 
     For the arguments see :meth:`batchpid.sim.Robot.load`. Raises RobotError for a file that cannot
-    be read, a structure or number without repair, a bad mesh, or an MJCF file that MuJoCo does not
-    compile.
+    be read, a structure or number without repair, or an MJCF file that MuJoCo does not compile.
     """
     findings: list[Finding] = []
     root = parse_xml(path, findings)
     if is_mjcf(root):
         name = root.get("model") or path.stem
-        source = read_mjcf(path, name, findings, fixed_base, missing_meshes)
+        source = read_mjcf(path, name, findings, fixed_base)
     else:
-        source = read_urdf(
-            root,
-            path,
-            findings,
-            fixed_base,
-            package_dirs,
-            missing_meshes,
-        )
+        source = read_urdf(root, path, findings, fixed_base, package_dirs)
     joints = [joint.name for joint in source.tables.joints]
     for name in (source.name, *joints, *source.tables.links):
         if not is_name(name):
             raise RobotError(
                 f"{path}: the name {name!r} has a control character or a line break; rename it"
             )
-    return source._replace(package_dirs=package_dirs)
+    return source
 
 
 def is_mjcf(root: etree._Element) -> bool:

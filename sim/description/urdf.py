@@ -71,11 +71,10 @@ def read_urdf(
     findings: list[Finding],
     fixed_base: bool | None,
     package_dirs: tuple[Path, ...],
-    missing_meshes: str,
 ) -> Source:
     """Return the robot of the root element of a URDF, with ``findings`` of reading the file.
 
-    Raises RobotError for a structure or number without repair, and for a bad mesh.
+    Raises RobotError for a structure or number without repair.
     """
     _check_root(root, path)
     reader = ElementReader(path, package_dirs, findings)
@@ -94,7 +93,7 @@ def read_urdf(
     if fixed_base is None:
         fixed_base = start is None
     tables = _read_tables(links, joints, path, reader)
-    reader.report_missing(missing_meshes)
+    reader.report_missing()
     name = root.get("name", "").strip() or path.stem
     return Source(
         path,

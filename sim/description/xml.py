@@ -16,7 +16,7 @@ from lxml import etree
 
 from batchpid.errors import RobotError
 from batchpid.sim.findings import Finding
-from batchpid.sim.geometry.mesh_files import LARGEST_NUMBER, LFS_POINTER, parse_bytes
+from batchpid.sim.geometry.mesh_files import LARGEST_NUMBER, LFS_POINTER
 
 XML_SIZE_LIMIT = 2**25  # bytes of a file; its tree takes about ten times as much memory
 MOST_PREFIXES = 100  # of namespaces that nobody declared
@@ -78,7 +78,14 @@ def _drop_default_namespace(root: etree._Element) -> None:
 
 
 def _parse(data: bytes) -> etree._Element:
-    return parse_bytes(data, remove_comments=True, remove_pis=True)
+    parser = etree.XMLParser(
+        resolve_entities=False,
+        no_network=True,
+        load_dtd=False,
+        remove_comments=True,
+        remove_pis=True,
+    )
+    return etree.fromstring(data, parser)
 
 
 def _lenient(data: bytes) -> etree._Element:

@@ -202,15 +202,13 @@ def create_datasets(
 
 
 def _urdf_of(info: RunInfo) -> str | None:
-    """Return the robot of a run as a URDF; None for one whose file is gone or has changed."""
-    robot = info.description
-    if robot is None:
+    """Return the robot of a run as a URDF; None for one that a URDF cannot hold."""
+    if info.description is None:
         return info.urdf
-    if robot.path.is_file():  # reading a pipe again could block
-        from batchpid.sim.robot.urdf_export import to_urdf
+    from batchpid.sim.robot.urdf_export import to_urdf
 
-        with suppress(RobotError):
-            return to_urdf(robot).text
+    with suppress(RobotError):
+        return to_urdf(info.description).text
     return None
 
 

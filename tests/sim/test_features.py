@@ -162,7 +162,7 @@ def test_every_feature_is_followed_along_a_trajectory(feature, engine):
 def test_every_feature_is_in_an_exported_description(feature, kind, tmp_path):
     """Read again, it is a robot with the same joints and dynamics."""
     robot, path = robot_with(feature, folder=tmp_path), tmp_path / f"featured.{kind}"
-    exported = to_urdf(robot, tmp_path) if kind == "urdf" else to_mjcf(robot, None, 1 / 2000)
+    exported = to_urdf(robot) if kind == "urdf" else to_mjcf(robot, None, 1 / 2000)
     path.write_text(exported.text)
     other = Robot.load(path, fixed_base=robot.fixed_base)
     assert other.joint_names == robot.joint_names

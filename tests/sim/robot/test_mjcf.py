@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from batchpid.errors import RobotError
-from batchpid.sim import Robot, Runner, to_urdf
+from batchpid.sim import Robot, Runner
 from batchpid.sim.engine.mujoco.model_builder import robot_model
 from batchpid.sim.engine.protocol import SceneSpec
 from batchpid.sim.engine.scene_spec import SOLVERS
@@ -79,13 +79,6 @@ WALKER = f"""
   </worldbody>
 </mujoco>"""
 TEXTS = {"arm": ARM, "chain": CHAIN, "walker": WALKER}
-
-
-@pytest.fixture(autouse=True)
-def hulls(tmp_path, monkeypatch):
-    """Folder of the hulls of meshes."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    return tmp_path / "cache/batchpid/meshes"
 
 
 @pytest.fixture
@@ -414,42 +407,31 @@ def test_what_cannot_be_simulated_is_refused(load, name):
 INERTIAL = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
 
 
-def test_missing_meshes(load, tmp_path):
-    """A mesh may be missing if the mass of its body is known, and is named."""
-    asset = '<compiler meshdir="parts"/><asset><mesh name="m" file="gone.stl"/></asset>'
-    shown = '<geom type="mesh" mesh="m" contype="0" conaffinity="0"/>'
-    drawn = two_links(rest=asset, geom=INERTIAL + BOX + shown)
-    assert load(drawn, missing_meshes="error").repairs == ()
-    for shape in ('<geom type="mesh" mesh="m"/>', '<geom type="box" mesh="m"/>'):
-        for body in (f"{INERTIAL}{shape}", BOX + shape.replace("/>", ' mass="0"/>')):
-            text = two_links(rest=asset, geom=body)
-            (finding,) = load(text).repairs
-            assert finding.code == "missing-mesh"
-            assert "gone.stl" in finding.text
-            with pytest.raises(RobotError, match=r"gone\.stl"):
-                load(text, missing_meshes="error")
-    # A <pair> of the shape goes with it.
-    geoms = f'{INERTIAL}<geom name="box" size=".1"/><geom name="m" type="mesh" mesh="m"/>'
-    pair = '<contact><pair geom1="m" geom2="box"/></contact>'
-    (finding,) = load(two_links(rest=asset + pair).replace(BOX, geoms, 1)).repairs
-    assert finding.code == "missing-mesh"
+def test_files_that_are_only_drawn_may_be_missing(load, tmp_path):
+    asset = '<texture name="t" type="2d" file="gone.png"/><material name="t" texture="t"/>'
+    asset = f'<compiler meshdir="parts"/><asset>{asset}<mesh name="m" file="gone.stl"/></asset>'
+    shown = '<geom type="mesh" mesh="m" material="t" contype="0" conaffinity="0"/>'
+    box = BOX.replace("<geom", '<geom material="t"')
+    assert load(two_links(rest=asset, geom=INERTIAL + box + shown)).repairs == ()
+    solid = two_links(rest=asset, geom=INERTIAL + '<geom type="mesh" mesh="m"/>')
     (tmp_path / "parts").mkdir()
-    (tmp_path / "parts" / "gone.stl").write_bytes(b"solid wedge")
-    with pytest.raises(RobotError, match=r"MuJoCo cannot compile the file: .*(gone|'m')"):
-        load(text)
+    for content in (None, b"solid wedge"):
+        if content is not None:
+            (tmp_path / "parts" / "gone.stl").write_bytes(content)
+        with pytest.raises(RobotError, match=r"MuJoCo cannot compile the file: .*(gone|'m')"):
+            load(solid)
 
 
-@pytest.mark.parametrize("mode", ["skip", "error"])
 @pytest.mark.parametrize("drawn", ["", 'contype="0" conaffinity="0"'])
 @pytest.mark.parametrize("inferred", [False, True])
-def test_a_missing_mesh_without_which_the_mass_is_unknown_is_refused(load, mode, drawn, inferred):
+def test_a_missing_mesh_without_which_the_mass_is_unknown_is_refused(load, drawn, inferred):
     asset = f'<compiler inertiafromgeom="{"true" if inferred else "auto"}"/>'
     asset += '<asset><mesh name="m" file="gone.stl"/></asset>'
     shape = f'<geom type="mesh" mesh="m" {drawn}/>'
     for geom in (shape, BOX + shape, BOX + shape.replace("/>", ' mass="2"/>')):
         text = two_links(geom=INERTIAL * inferred + geom, rest=asset)
         with pytest.raises(RobotError, match=r"gone\.stl.*restore the file"):
-            load(text, missing_meshes=mode)
+            load(text)
 
 
 @pytest.mark.parametrize("name", ["robot.xml", "robot.urdf"])
@@ -461,27 +443,6 @@ def test_a_git_lfs_pointer_in_place_of_the_robot_is_named(tmp_path, name):
         RobotError, match=r"robot\.\w+: a git-lfs pointer instead of the file; run git lfs pull"
     ):
         Robot.load(tmp_path / name)
-
-
-def test_a_mesh_beside_a_missing_one_keeps_its_shape(load, tmp_path):
-    """MuJoCo looks up meshes in meshdir or assetdir, with strippath without their folders."""
-    (tmp_path / "parts").mkdir()
-    (tmp_path / "parts" / "here.obj").write_text(
-        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
-    )
-    geom = f'{INERTIAL}<geom type="mesh" mesh="here"/><geom type="mesh" mesh="gone"/>'
-    absolute = tmp_path / "parts" / "here.obj"
-    for compiler, file in (
-        ('meshdir="parts"', "here.obj"),
-        ('assetdir="parts"', "here.obj"),
-        ('meshdir="parts" strippath="true"', "x/y/here.obj"),
-        ('meshdir="elsewhere"', absolute),
-    ):
-        asset = (
-            f'<asset><mesh name="here" file="{file}"/><mesh name="gone" file="x/gone.obj"/></asset>'
-        )
-        (missing,) = load(two_links(geom=geom, rest=f"<compiler {compiler}/>{asset}")).repairs
-        assert "without: x/gone.obj" in missing.text
 
 
 def test_a_default_namespace_changes_nothing(load, tmp_path):
@@ -530,14 +491,6 @@ def test_a_damaged_file_is_a_robot_or_an_error(load, seed, tmp_path, monkeypatch
         )
         with suppress(RobotError):
             load(text[:begin] + part + text[begin + rng.randrange(8) :])
-
-
-def test_an_unwritable_cache_is_an_error(load, monkeypatch, tmp_path):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    robot = load(ARM)
-    with pytest.raises(RobotError, match=r"cannot be written.*XDG_CACHE_HOME"):
-        to_urdf(robot)
 
 
 def test_a_name_in_another_encoding_is_an_error_with_the_file(tmp_path):
