@@ -86,7 +86,7 @@ class Runner(SingleOwner):
         link ``tool``, or a :class:`batchpid.sim.Controller`; forces that are compensated.
     timestep, substeps
         Time step of simulation and control [s]; sim steps of a tick.
-    free_joints, actuators, plan, guard, stages
+    actuators, plan, guard, stages
         Motors and sensors, default the robot's; plan of a slow policy; limits of setpoints; further
         stages of a sim step.
     engine, physics, collisions, ground, build
