@@ -305,9 +305,8 @@ class Controller(Protocol):
     effort of an env must depend on its own rows alone. It travels to the workers by cloudpickle,
     and may call NumPy or a jitted function.
 
-    A setpoint has a number for each joint, unless the controller has an attribute ``command``: a
-    :class:`batchpid.sim.CommandSpec`, or a sequence of names, such as ``("x", "y")``. Then it is
-    (envs, size).
+    A setpoint has a number for each joint, unless the controller has an attribute ``command``, a
+    :class:`batchpid.sim.CommandSpec`. Then it is (envs, size).
 
     A snapshot fits a controller of the same class, whose attribute ``version`` is the same where it
     has one.

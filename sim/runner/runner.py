@@ -28,7 +28,7 @@ from batchpid.sim.diagnosis.loop_stability import StabilityCheck
 from batchpid.sim.findings import report_shortfalls
 from batchpid.sim.loop.arrays import Snapshot
 from batchpid.sim.loop.faults import Fault, FaultWarning
-from batchpid.sim.loop.group_control import describe, native_obstacle
+from batchpid.sim.loop.group_control import describe
 from batchpid.sim.options.options import (
     OPTIONS,
     RunnerKeywords,
@@ -161,8 +161,6 @@ class Runner(SingleOwner):
     def __repr__(self) -> str:
         options = self.options
         state = "closed" if self.closed else f"at {self.time:g} s"
-        if options.stages and (reason := native_obstacle(options)):
-            state += f", law in NumPy or JAX ({reason})"
         return (
             f"Runner({self.robot.name}, {self.num_envs} envs, {options.workers} workers,"
             f" control {options.control_name!r}, {options.engine}, timestep {self.timestep:g} s,"

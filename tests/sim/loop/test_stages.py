@@ -100,11 +100,10 @@ class Fan(Stage):
 
 def test_a_stage_that_programs_cannot_have_runs_in_numpy_and_the_runner_says_so(panda):
     with Runner(panda, 2, workers=0, stages=[Fan()]) as runner:
-        assert "stage 'fan': programs have no operation 'arctan'" in repr(runner)
-        assert "'fan'" in runner.backend
+        assert "stage 'fan': programs have no operation 'arctan'" in runner.backend
         assert runner.step(panda.start).ok.all()
     with Runner(panda, 2, workers=0, stages=[Thermal(8.0, 0.05)]) as runner:
-        assert "stage" not in repr(runner)
+        assert "stage" not in runner.backend
 
 
 @dataclass(frozen=True)
@@ -127,7 +126,7 @@ def test_exp_tanh_and_sin_run_natively_as_in_numpy(panda, monkeypatch):
     for native in "10":
         monkeypatch.setenv("BATCHPID_NATIVE", native)
         with Runner(panda, 2, workers=0, stages=[Wave()]) as runner:
-            assert "stage" not in repr(runner)
+            assert "stage" not in runner.backend
             rows.append(runner.rollout(np.broadcast_to(panda.target, (10, 2, panda.dof))))
     np.testing.assert_allclose(rows[0].qpos, rows[1].qpos, rtol=0, atol=1e-9)
     np.testing.assert_allclose(rows[0].effort, rows[1].effort, rtol=1e-6, atol=1e-6)
