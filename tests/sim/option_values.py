@@ -42,7 +42,7 @@ SENSORS = {
     "backlash": 1e-3,
     "position_resolution": 1e-4,
 }
-NOISE = {"position_noise": 1e-5, "velocity_noise": 1e-3, "velocity_resolution": 1e-3}
+NOISE = {"position_noise": 1e-5, "velocity_noise": 1e-3}
 LINE = {
     "saturation_effort": 8.0,
     "no_load_speed": 3.0,
