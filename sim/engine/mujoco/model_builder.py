@@ -102,8 +102,7 @@ def robot_model(spec: SceneSpec) -> RobotMj:
         raise _refusal(error) from error
     bodies = {link: model.body(name).id for link, name in names.items()}
     for row in spec.simulated.bodies:  # the compiler refuses some inertias that both simulate
-        moments, _ = principal_inertia(row.spatial_inertia)
-        model.body_inertia[bodies[row.name]] = moments
+        model.body_inertia[bodies[row.name]], _ = row.spatial_inertia.principal
     mujoco.mj_setConst(model, mujoco.MjData(model))
     _choose_solver(model)
     return RobotMj(
@@ -201,9 +200,9 @@ def principal_inertia(inertia: SpatialInertia) -> tuple[Float64, Float64]:
     """Return principal moments (3,) [kg m^2] and the rotation of the principal axes (4,), in the
     axes of the body.
     """
-    moments, axes = np.linalg.eigh(inertia.tensor)
+    moments, axes = inertia.principal
     wxyz = np.empty(4)
-    mujoco.mju_mat2Quat(wxyz, (axes * np.linalg.det(axes)).ravel())  # a rotation, not a reflection
+    mujoco.mju_mat2Quat(wxyz, axes.ravel())
     return moments, wxyz
 
 

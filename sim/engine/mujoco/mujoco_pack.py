@@ -6,7 +6,7 @@ Longer than 350 lines because that is the whole interface between loop and engin
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
@@ -140,9 +140,7 @@ class MujocoPack(EnginePack):
         return np.array([data.qvel[self._moves] for data in self.data])
 
     def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
-        if self.steps_read_force(gravity, coriolis):
-            if self._free is not None:
-                return self._force(self.force_model, True, True)
+        if self._free is None and self.steps_read_force(gravity, coriolis):
             return np.array([data.qfrc_bias[self._moves] for data in self.data])
         return self._force(self.force_model, gravity, coriolis)
 
@@ -302,17 +300,32 @@ class MujocoPack(EnginePack):
         values = {"dof_armature": np.maximum(armature + self._add_joints(actuators), 0.0)}
         if self.spec.mjcf is not None and self._variation.damping is not None:
             values["dof_damping"] = np.maximum(damping + self._variation.damping, 0.0)
-        tables = {name: np.broadcast_to(table, self.qf.shape) for name, table in values.items()}
-        for row in range(self.size) if rows is None else rows:
-            for name, table in tables.items():
-                if not np.array_equal(
-                    getattr(self.models[row], name)[self._robot.qvel], table[row]
-                ):
-                    # A copy only where it differs: a model takes much memory.
-                    model = self._own_model(row)
-                    getattr(model, name)[self._robot.qvel] = table[row]
-                    mujoco.mj_setConst(model, self._scratch)
+        everyone = range(self.size)
+        for row in self._set(everyone if rows is None else rows, self._moves, values):
+            mujoco.mj_setConst(self.models[row], self._scratch)
         self._share()
+
+    def _set(
+        self,
+        rows: Iterable[int],
+        at: slice | Rows,
+        values: Mapping[str, Rows],
+    ) -> list[int]:
+        """Set the entries ``at`` of fields of the models of robots ``rows`` to ``values`` (M | 1,
+        entries, ...); return the robots whose models changed.
+        """
+        changed = []
+        for row in rows:
+            present = {name: table[row % len(table)] for name, table in values.items()}
+            model = self.models[row]
+            # A copy only where they differ: a model takes much memory.
+            if all(np.array_equal(getattr(model, name)[at], new) for name, new in present.items()):
+                continue
+            model = self._own_model(row)
+            for name, new in present.items():
+                getattr(model, name)[at] = new
+            changed.append(row)
+        return changed
 
     def _share(self) -> None:
         """Return to one shared model if neither masses nor worlds nor armature nor drives of the
@@ -397,18 +410,14 @@ class MujocoPack(EnginePack):
         self._stiffness, self._rate_gain = (
             np.broadcast_to(table, self.qf.shape).copy() for table in (stiffness, damping)
         )
-        gains = np.stack(
-            [-self._stiffness, -self._rate_gain - self.spec.timestep * self._stiffness], axis=2
-        )
-        for row in range(self.size):
-            model = self.models[row]
-            if not (
-                np.array_equal(model.actuator_biasprm[:, 1:3], gains[row])
-                and np.array_equal(model.actuator_forcerange[:, 1], limit[row])
-            ):
-                model = self._own_model(row)
-                model.actuator_biasprm[:, 1:3] = gains[row]
-                model.actuator_forcerange[:] = np.stack([-limit[row], limit[row]], axis=1)
+        bias = np.zeros((*self.qf.shape, mujoco.mjNBIAS))
+        bias[..., 1] = -self._stiffness
+        bias[..., 2] = -self._rate_gain - self.spec.timestep * self._stiffness
+        values = {
+            "actuator_biasprm": bias,
+            "actuator_forcerange": np.stack([-limit, limit], axis=2),
+        }
+        self._set(range(self.size), slice(None), values)
         self._update(range(self.size))
 
     def write_drive_target(self, position: Rows, velocity: Rows | None = None) -> None:
