@@ -156,7 +156,7 @@ def _arms(robot: RobotMj, pairs: NDArray[np.intp]) -> tuple[Float64, Float64]:
             across = np.linalg.norm(np.cross(points[:, :3], axes[at]), axis=1)
             arms[at] = (across + points[:, 3]).max(initial=0.0)
         add(data.xpos[body], reach, model.body_parentid[body])
-    floats = robot.base is not None
+    floats = len(model.jnt_type) > dof
     moved = np.zeros((model.nbody, dof + 2 * floats), bool)
     for body in range(1, model.nbody):
         # What moves a body moves its children.
@@ -214,7 +214,7 @@ class GroupClearance:
         robots = len(data)
         pairs = len(tables["pairs"])
         bodies = models[0].nbody
-        floats = bool((models[0].jnt_type == mujoco.mjtJoint.mjJNT_FREE).any())
+        floats = models[0].njnt > dof
         blocks, ways = -(-robots // WIDTH), dof + 2 * floats
         arrays = tables | {
             # Native code reads the places of shapes where MuJoCo writes them.
@@ -369,13 +369,10 @@ class FreeMotions:
         is_touching = self.contact == number("Contact", "SOME")
         self.contact[is_touching] = number("Contact", "UNKNOWN")
 
-    def read(self) -> tuple[Float64, Float64, Float64]:
-        """Return positions, velocities and last accelerations (M, dof)."""
-        qpos, qvel, acceleration = (
-            np.array(array.swapaxes(1, 2).reshape(-1, array.shape[1])[: self.size])
-            for array in self._states
-        )
-        return qpos, qvel, acceleration
+    def read(self, state: int) -> Float64:
+        """Return positions, velocities or last accelerations (M, dof): ``state`` 0, 1, 2."""
+        array = self._states[state]
+        return np.array(array.swapaxes(1, 2).reshape(-1, array.shape[1])[: self.size])
 
     def write(self, rows: Sequence[int] | slice, *states: Rows | float) -> None:
         """Set positions, velocities and last accelerations (len(rows), dof) of robots ``rows``."""

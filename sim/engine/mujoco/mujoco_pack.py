@@ -61,7 +61,7 @@ class MujocoPack(EnginePack):
         else:
             links = *(spec.contacts or ()), *(spec.wrenches or ()), spec.carrier
             check_links(spec, spec.mjcf, filter(None, links))
-        self._stiffness = self._rate_gain = self._target_rate = np.zeros((1, self.dof))
+        self._stiffness = self._rate_gain = np.zeros((1, self.dof))
         self._robot = robot = robot_model(spec)
         if workspace is None:
             workspace = {}
@@ -131,12 +131,12 @@ class MujocoPack(EnginePack):
 
     def read_qpos(self) -> Float64:
         if self._free is not None:
-            return self._free.read()[0]
+            return self._free.read(0)
         return np.array([data.qpos[self._at] for data in self.data])
 
     def read_qvel(self) -> Float64:
         if self._free is not None:
-            return self._free.read()[1]
+            return self._free.read(1)
         return np.array([data.qvel[self._moves] for data in self.data])
 
     def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
@@ -208,7 +208,7 @@ class MujocoPack(EnginePack):
         """Return pose and velocities of the bodies of floating bases (M, 13), angular ones in the
         body's axes.
         """
-        qpos, qvel = self._robot.base or (0, 0)
+        qpos, qvel = self._robot.base
         parts = slice(qpos, qpos + FLOATING + 1), slice(qvel, qvel + FLOATING)
         return np.array(
             [np.concatenate([data.qpos[parts[0]], data.qvel[parts[1]]]) for data in self.data]
@@ -237,7 +237,7 @@ class MujocoPack(EnginePack):
     def push(self, rows: Sequence[int], twists: Float64) -> None:
         data = self.data
         turns = matrix_of(self._bases()[rows, 3:7])
-        _, at = self._robot.base or (0, 0)
+        _, at = self._robot.base
         for row, twist, turn in zip(rows, twists, turns, strict=True):
             data[row].qvel[at : at + 3] += twist[:3]
             # MuJoCo's angular velocities are in the body's axes.
@@ -272,9 +272,8 @@ class MujocoPack(EnginePack):
     ) -> None:
         """Write the states of robots ``rows`` to their data."""
         everyone = self._pool.take(self.models, self.rows, rows)
-        floats = self._robot.base is not None
         bases = np.tile(BASE_AT_REST, (len(rows), 1)) if base is None else base.copy()
-        at, moves = self._robot.base or (0, 0)
+        at, moves = self._robot.base
         # MuJoCo's angular velocities are in the body's axes.
         bases[:, 10:] = unrotate(matrix_of(bases[:, 3:7]), bases[:, 10:])
         for row, root, position, velocity in zip(rows, bases, qpos, qvel, strict=True):
@@ -282,7 +281,7 @@ class MujocoPack(EnginePack):
             # Everything else of the scene returns to its start, but drives keep their targets.
             ctrl = data.ctrl.copy()
             rest(self.models[row], data)
-            if floats:
+            if not self.spec.fixed_base:
                 data.qpos[at : at + FLOATING + 1], data.qvel[moves : moves + FLOATING] = np.split(
                     root, [FLOATING + 1]
                 )
@@ -421,9 +420,8 @@ class MujocoPack(EnginePack):
         self._update(range(self.size))
 
     def write_drive_target(self, position: Rows, velocity: Rows | None = None) -> None:
-        if velocity is not None:
-            self._target_rate = velocity
-        values = self._stiffness * position + self._rate_gain * self._target_rate
+        rate = 0.0 if velocity is None else velocity
+        values = self._stiffness * position + self._rate_gain * rate
         if self._free is not None:
             self._free.ctrl[...] = values
             return

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -351,10 +352,7 @@ class Pack(EnginePack):
             )
             parts = robot.get_qpos(), robot.get_qvel(), read_body(robot.root), turned, *content
             rows.append(np.concatenate(parts, dtype=np.float64))
-        states = np.full((self.size, max(map(len, rows))), np.nan)
-        for state, values in zip(states, rows, strict=True):
-            state[: len(values)] = values
-        return states
+        return np.array([*zip_longest(*rows, fillvalue=np.nan)]).T.copy()
 
     def write_state_rows(self, states: Float64) -> None:
         ends = np.cumsum([self.dof, self.dof, ROOT_SIZE, self._turning.size])
@@ -400,11 +398,11 @@ class Pack(EnginePack):
             joint.set_drive_properties(*map(float, values), "force")
 
     def write_drive_target(self, position: Rows, velocity: Rows | None = None) -> None:
-        for joint, target in zip(self._joints, position.ravel().tolist(), strict=True):
+        rates = np.zeros_like(position) if velocity is None else velocity
+        targets = position.ravel().tolist(), rates.ravel().tolist()
+        for joint, target, rate in zip(self._joints, *targets, strict=True):
             joint.set_drive_target(target)
-        if velocity is not None:
-            for joint, target in zip(self._joints, velocity.ravel().tolist(), strict=True):
-                joint.set_drive_velocity_target(target)
+            joint.set_drive_velocity_target(rate)
 
     def close(self) -> None:
         self.robots = []
