@@ -212,10 +212,8 @@ def _set_options(scene: MjSpec, spec: SceneSpec) -> None:
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     option.iterations = solver.iterations
     option.tolerance = solver.tolerance
-    if solver.elliptic:
-        option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    else:
-        option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    cones = mujoco.mjtCone
+    option.cone = cones.mjCONE_ELLIPTIC if solver.elliptic else cones.mjCONE_PYRAMIDAL
     # A diverged env must stay visible: the loop suspends or resets it, and reports it.
     option.disableflags |= off.mjDSBL_AUTORESET | off.mjDSBL_ACTUATION
 

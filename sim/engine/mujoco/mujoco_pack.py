@@ -73,22 +73,15 @@ class MujocoPack(EnginePack):
         self.models, self.rows = [self._pool.model] * self.size, self._pool.initial(self.size)
         self._at, self._moves = robot.qpos, robot.qvel
         self._free: FreeMotions | None = None
-        if self.steps_natively and self._moves_freely:
+        # A robot that touches nothing is then a tree of rigid bodies, under efforts alone.
+        is_tree = spec.fixed_base and spec.mjcf is None and self.dof > 0
+        if self.steps_natively and is_tree and place_of_contacts() is not None:
             self._free = FreeMotions(robot, self.joint_model, self._sensed)
         self._change_world(range(self.size))
         self._change_masses(range(self.size))
         self._update(range(self.size))
         if variation is not None:
             self.write_joints(None)
-
-    @property
-    def _moves_freely(self) -> bool:
-        """Whether a robot that touches nothing is a tree of rigid bodies on a fixed base, under
-        efforts alone.
-        """
-        spec = self.spec
-        is_tree = spec.fixed_base and spec.mjcf is None and self.dof > 0
-        return is_tree and place_of_contacts() is not None
 
     @property
     def data(self) -> list[MjData]:
@@ -239,9 +232,8 @@ class MujocoPack(EnginePack):
         turns = matrix_of(self._bases()[rows, 3:7])
         _, at = self._robot.base
         for row, twist, turn in zip(rows, twists, turns, strict=True):
-            data[row].qvel[at : at + 3] += twist[:3]
             # MuJoCo's angular velocities are in the body's axes.
-            data[row].qvel[at + 3 : at + FLOATING] += turn.T @ twist[3:]
+            data[row].qvel[at : at + FLOATING] += [*twist[:3], *(turn.T @ twist[3:])]
         self._evaluate(rows)
 
     def write_state(

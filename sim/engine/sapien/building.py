@@ -61,8 +61,9 @@ def articulation_builder(spec: SceneSpec) -> ArticulationBuilder:
             parent = links[joint.parent_link]
         links[body.name] = link = builder.create_link_builder(parent)
         link.set_name(body.name)
-        moments, axes = body.spatial_inertia.principal
-        link.set_mass_and_inertia(body.mass, _pose(body.center, axes), moments)
+        moments, axes = _principal(body.inertia)
+        frame = _pose(body.center, matrix_of(body.inertia_wxyz))
+        link.set_mass_and_inertia(body.mass, frame * _pose(np.zeros(3), axes), moments)
         if joint is None:
             kind = "fixed" if spec.fixed_base else "undefined"
             link.set_joint_properties(kind, [], Pose(), Pose())
@@ -123,6 +124,18 @@ def _axes_along(axis: tuple[float, ...]) -> Float64:
     second = np.cross(first, [0, 0, 1] if abs(first[0]) > 0.9 else [1, 0, 0])
     second /= np.linalg.norm(second)
     return np.column_stack([first, second, np.cross(first, second)])
+
+
+def _principal(inertia: Float64) -> tuple[Float64, Float64]:
+    """Return the principal moments (3,) and axes (3, 3), those of the frame if they are
+    principal.
+    """
+    moments = np.diag(inertia)
+    axes = np.eye(3)
+    if not np.array_equal(np.diag(moments), inertia):
+        moments, axes = np.linalg.eigh(inertia)
+        axes[:, 2] *= np.sign(np.linalg.det(axes))
+    return moments, axes
 
 
 def set_inertia(link: physx.PhysxArticulationLinkComponent, inertia: SpatialInertia) -> None:

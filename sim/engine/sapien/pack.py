@@ -74,11 +74,9 @@ class Pack(EnginePack):
         self.qf = np.zeros((size, self.dof), np.float32)
         continuous = np.array([joint.continuous for joint in spec.joints], bool)
         self._couple(continuous, None, self.qf)
-        self._joint_qf = self.qf
-        self._turning = np.array([], np.intp)
-        if self._constraint is not None:
-            self._joint_qf = np.zeros_like(self.qf)
-            self._turning = np.flatnonzero(continuous)
+        is_coupled = self._constraint is not None
+        self._joint_qf = np.zeros_like(self.qf) if is_coupled else self.qf
+        self._turning = np.flatnonzero(continuous & is_coupled)
         self._bind()
         if variation is not None:
             self.write_joints(None)
@@ -249,7 +247,7 @@ class Pack(EnginePack):
         sensed = self.spec.contacts or ()
         bodies = self.spec.simulated.links
         forces = np.zeros((self.size, len(sensed), 3))
-        for row in np.flatnonzero(self._stepped) if sensed else ():
+        for row in np.flatnonzero(self._stepped):
             entities = {link.name: link.entity for link in self.robots[row].links}
             places = {entities[bodies[link].link]: place for place, link in enumerate(sensed)}
             for contact in self.systems[row].get_contacts():
@@ -257,7 +255,7 @@ class Pack(EnginePack):
                 for body, sign in zip(contact.bodies, (1.0, -1.0), strict=True):
                     if (place := places.get(body.entity)) is not None:
                         forces[row, place] += sign * impulse / self.spec.timestep
-        return {"contact_force": forces, "touching": np.abs(forces).sum(2)} if sensed else {}
+        return {"contact_force": forces, "touching": np.abs(forces).sum(2)}
 
     def write_state(
         self,
