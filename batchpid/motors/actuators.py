@@ -162,7 +162,7 @@ class Actuators(Record, _ActuatorsFields):
         return make_actuators(**{"joints": self.num_joints, **present, **options})
 
     def __repr__(self) -> str:
-        return array_summary(self._replace(seed=None), "envs", "joints")
+        return array_summary(self._replace(seed=None))
 
 
 @with_fields(*ACTUATOR_FIELDS)
@@ -332,7 +332,7 @@ class ActuatorState(Record, _ActuatorStateFields):
     NAME = "state"
 
     def __repr__(self) -> str:
-        return array_summary(self._replace(key=None, step=None), "envs", "joints")
+        return array_summary(self._replace(key=None, step=None))
 
     def matched_to(self, fresh: ActuatorState) -> ActuatorState:
         """Return this state with exactly the leaves of ``fresh``: missing ones from there, the

@@ -37,8 +37,7 @@ class FaultArrays(NamedTuple):
     """Last fault of each env (envs,): sim step (-1: none), joint, and index into
     :data:`batchpid.sim.loop.faults.CAUSES`.
 
-    Where the cause is one of :data:`batchpid.sim.loop.faults.COMMAND_CAUSES`, ``joint`` is the
-    entry of the command.
+    Where the cause is an array of the command, ``joint`` is its entry.
     """
 
     step: NDArray[np.int64]
@@ -93,7 +92,7 @@ class Arrays(NamedTuple):
 _SAME_CONTENT = "take one with the same build=, and keep each env's number where it depends on it"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Snapshot:
     """State of all envs of a runner at one moment. ``pickle`` keeps it in a file."""
 
@@ -172,13 +171,6 @@ class Snapshot:
     def copy(self) -> Snapshot:
         """Return a snapshot with arrays of its own."""
         return self.for_envs(slice(None))
-
-    def __repr__(self) -> str:
-        about = self.about
-        return (
-            f"Snapshot({about.get('robot')}, {about.get('num_envs')} envs, control"
-            f" {about.get('control')!r}, after {self.steps} sim steps)"
-        )
 
 
 def join_rows(parts: Sequence[dict[str, Rows]]) -> dict[str, Rows]:

@@ -425,8 +425,8 @@ class ControlOptions(OptionGroup):
     or when a position is beyond 1e6 rad or m. The other envs are not affected.
     """
     on_invalid_input: Annotated[InvalidInputAction, option("next commands")] = "raise"
-    """Response to NaN or infinity in a command or in a pose to reset to: ``"raise"`` (default)
-    raises an error, and ``"contain"`` lets only the env concerned fail.
+    """Response to NaN or infinity in a command: ``"raise"`` (default) raises an error, and
+    ``"contain"`` lets only the env concerned fail.
     """
 
     def fit(self, robot: Robot) -> Self:

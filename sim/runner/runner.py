@@ -57,7 +57,6 @@ from batchpid.sim.runner.operations import (
 )
 from batchpid.sim.signals import CommandSpec, Observation, empty_observation
 from batchpid.sim.tool_space import OperationalSpace
-from batchpid.sim.workers.node import NodeInfo
 from batchpid.sim.workers.pool import Outcome, RecoveryWarning, WorkerPool
 from batchpid.sim.workers.requests import OneCall, Request
 from batchpid.stages.values import Command
@@ -145,8 +144,6 @@ class Runner(SingleOwner):
             self._call.end()
         self.reset(seed=None if self.options.randomization is None else 0)
         self._check_stability()
-        if isinstance(self.control, OperationalSpace):
-            self.control.check_stability()
 
     def _check_stability(self) -> None:
         """Warn of gains beyond the stability bound of the sampled loop."""
@@ -404,19 +401,8 @@ class Runner(SingleOwner):
 
     @property
     def actuators(self) -> bp.Actuators | None:
-        """Actuators, None for ideal ones; assign others to change them in flight. Delays keep their
-        histories.
-
-        As in the option, assign None for the robot's own actuators, and ``bp.Actuators()`` for
-        ideal ones.
-        """
+        """Actuators; None for ideal ones. A snapshot brings its own."""
         return self._state.actuators
-
-    @actuators.setter
-    def actuators(self, actuators: bp.Actuators | None) -> None:
-        self._ready()
-        checked = self.options.check_actuators(actuators)
-        self._execute(Request("set_actuators", (checked,)))
 
     def snapshot(self) -> Snapshot:
         """Return the state of all envs, physics and controller, for :meth:`restore`.
@@ -547,11 +533,6 @@ class Runner(SingleOwner):
     def pids(self) -> tuple[int, ...]:
         """Process ids of the workers."""
         return tuple(worker.pid for worker in self._pool.workers if worker.pid is not None)
-
-    @property
-    def nodes(self) -> tuple[NodeInfo, ...]:
-        """Machines of a cluster, in the order of their envs; empty without ``cluster``."""
-        return self._pool.nodes
 
     def close(self) -> None:
         """End the workers and free the scenes. May be called again, as after an interrupt."""

@@ -31,7 +31,7 @@ def test_replace():
     actuators = bp.make_actuators(2, strength=[[0.9, 1.0], [1.1, 1.2]], bias=0.5)
     assert actuators.replace(bias=None).bias is None
     np.testing.assert_array_equal(actuators.replace(lag=0.01).strength, actuators.strength)
-    assert repr(actuators) == "Actuators(2 envs, 2 joints, strength 0.9 to 1.2, bias 0.5)"
+    assert repr(actuators) == "Actuators(strength (2, 2), bias (1, 2))"
     with pytest.raises(InvalidArgumentError, match="every effect is off"):
         bp.make_actuators(2).replace(lag=0.1)
 

@@ -152,7 +152,6 @@ def test_a_call_with_any_value_changes_nothing_if_it_is_refused(contain):
             "reset": {"qpos": ROW, "qvel": ROW, "mask": np.ones(N, bool), "seed": None},
             "restore": {"snapshot": None},
             "params": {"params": PARAMS},
-            "actuators": {"actuators": None},
         }
         for method, good in calls.items():
             for name, value in product(good, ODD):
@@ -296,7 +295,6 @@ CALLS = [
             ("reset", {"base_twist": np.zeros(6)}),
             ("bodies", {"names": ["ball"]}),
             ("params", {"params": load_bundled("panda").params()}),
-            ("actuators", {"actuators": bp.make_actuators(3, strength=0.9)}),
         ],
     ),
     ({"params": ARM.params(kp=9.0)}, UNUSED),

@@ -126,7 +126,6 @@ REFUSED = {
 }
 CHANGES = {
     "params": lambda runner: setattr(runner, "params", gains().replace(kp=1.0)),
-    "actuators": lambda runner: setattr(runner, "actuators", bp.make_actuators(2, strength=2)),
     "snapshot": lambda runner: runner.restore(runner.snapshot()),
     "reset": lambda runner: runner.reset(np.full(2, 0.3), mask=[True, False]),
 }
