@@ -28,7 +28,7 @@ from batchpid.sim.diagnosis.loop_stability import StabilityCheck
 from batchpid.sim.findings import report_shortfalls
 from batchpid.sim.loop.arrays import Snapshot
 from batchpid.sim.loop.faults import Fault, FaultWarning
-from batchpid.sim.loop.group_control import describe, native_obstacle
+from batchpid.sim.loop.group_control import describe
 from batchpid.sim.options.options import (
     OPTIONS,
     RunnerKeywords,
@@ -82,7 +82,7 @@ class Runner(SingleOwner):
         link ``tool``, or a :class:`batchpid.sim.Controller`; forces that are compensated.
     timestep, substeps
         Time step of simulation and control [s]; sim steps of a tick.
-    free_joints, actuators, plan, guard, stages
+    actuators, plan, guard, stages
         Motors and sensors, default the robot's; plan of a slow policy; limits of setpoints; further
         stages of a sim step.
     engine, physics, collisions, ground, build
@@ -144,8 +144,6 @@ class Runner(SingleOwner):
             self._call.end()
         self.reset(seed=None if self.options.randomization is None else 0)
         self._check_stability()
-        if isinstance(self.control, OperationalSpace):
-            self.control.check_stability()
 
     def _check_stability(self) -> None:
         """Warn of gains beyond the stability bound of the sampled loop."""
@@ -155,8 +153,6 @@ class Runner(SingleOwner):
     def __repr__(self) -> str:
         options = self.options
         state = "closed" if self.closed else f"at {self.time:g} s"
-        if options.stages and (reason := native_obstacle(options)):
-            state += f", law in NumPy or JAX ({reason})"
         return (
             f"Runner({self.robot.name}, {self.num_envs} envs, {options.workers} workers,"
             f" control {options.control_name!r}, {options.engine}, timestep {self.timestep:g} s,"
