@@ -159,12 +159,8 @@ def _merged_joints(joints: Sequence[Joint], separate: Separate) -> set[str]:
     merged = {joint.name for joint in fixed}
     if _moving_order(joints, merged) == order:
         return merged
-    # Else joints without motion below them first, then one by one what keeps the order.
-    merged = {joint.name for joint in fixed if joint.child_link not in carriers}
-    for joint in fixed:
-        if _moving_order(joints, merged | {joint.name}) == order:
-            merged.add(joint.name)
-    return merged
+    # Else the joints without motion below them.
+    return {joint.name for joint in fixed if joint.child_link not in carriers}
 
 
 def _moving_order(joints: Sequence[Joint], merged: Collection[str]) -> list[str]:
