@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from arms import gains, load, motion, run
+from pages import ROOT, blocks
 
 import batchpid as bp
 from batchpid.sim import Randomization, Recorder, RecordingError, Runner, Uniform
@@ -156,6 +157,29 @@ def test_a_recording_is_refused_or_divided_at_a_change(robot, tmp_path, change):
         return
     with pytest.raises(bp.InvalidArgumentError, match=f"has .*{change} that w"):
         read_logs(robot, [path])
+
+
+def test_the_program_of_the_page_makes_a_log_of_a_bag(robot, tmp_path, monkeypatch):
+    rosbag2 = pytest.importorskip("rosbags.rosbag2")
+    from rosbags.typesys import Stores, get_typestore
+
+    types = get_typestore(Stores.LATEST)
+    names = ("std_msgs/msg/Header", "builtin_interfaces/msg/Time", "sensor_msgs/msg/JointState")
+    header, stamp, state = (types.types[name] for name in names)
+    monkeypatch.chdir(tmp_path)
+    storage = rosbag2.StoragePlugin.MCAP
+    with rosbag2.Writer("bag", version=9, storage_plugin=storage) as writer:
+        line = writer.add_connection("/joint_states", names[-1], typestore=types)
+        for time in TIME:
+            seconds, part = 1_700_000_000 + int(time), round(1e9 * (time % 1))
+            values = np.array([np.sin(time), np.cos(time)])
+            message = state(header(stamp(seconds, part), ""), [*JOINTS], values, 0 * values, values)
+            writer.write(line, 0, types.serialize_cdr(message, names[-1]))
+    exec(blocks(ROOT / "docs/sim-to-real.md", "text")[0]["code"], {})
+    (log,) = read_logs(robot, ["log.csv"])
+    np.testing.assert_allclose(log.time - log.time[0], TIME, atol=1e-6)
+    np.testing.assert_allclose(log.qpos, np.stack([np.sin(TIME), np.cos(TIME)], axis=1))
+    assert log.measured
 
 
 def test_files_that_are_no_logs_say_what_a_log_is(robot, tmp_path):
