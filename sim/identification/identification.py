@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
+from importlib.util import find_spec
 from multiprocessing import get_context
 from typing import Any, get_args
 
@@ -16,7 +17,7 @@ import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.arrays.elementwise import TURN
 from batchpid.checks import choice, flag, instance, integer, number
-from batchpid.errors import InvalidArgumentError
+from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.sim.identification.fit import fit
 from batchpid.sim.identification.log import CommandKind, Log, checked
 from batchpid.sim.identification.log_files import read_logs
@@ -110,7 +111,11 @@ def identify(
     InvalidArgumentError
         An option is out of range or contradicts a recording, a file holds no log of this robot, or
         setpoints were logged late.
+    MissingDependencyError
+        SciPy is not installed.
     """
+    if find_spec("scipy") is None:
+        raise MissingDependencyError("scipy", "identification", "tune")
     instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")
     kinds = [choice("extras", name, EXTRAS) for name in dict.fromkeys(extras)]
     evaluations = integer("evaluations", evaluations, 2, 1000)
