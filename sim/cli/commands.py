@@ -84,10 +84,7 @@ COMMANDS = {
     ),
     "identify": CommandFunction(
         identify_logs,
-        {
-            "out": Output("Actuators file", DOCUMENTS, "out/{robot}.actuators.yaml"),
-            "picture": PICTURE,
-        },
+        {"out": Output("Actuators file", DOCUMENTS, "out/{robot}.actuators.yaml")},
         ("base",),
     ),
     "export": CommandFunction(
