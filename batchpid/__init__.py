@@ -10,9 +10,8 @@ Params say how to control, a state is carried from step to step, and every array
     effort = pid(np.ones((64, 9)), np.zeros((64, 9)))  # setpoint, measurement
 
 - Control: :class:`BatchPID`, or the pure functions :func:`init`, :func:`step`, :func:`reset` and
-  :func:`track`, which take and return a :class:`PIDState`; :func:`discretise` and :func:`advance`
-  for loops with constant params; :func:`step_terms` returns all terms of the effort, as
-  :func:`advance` does.
+  :func:`track`, which take and return a :class:`PIDState`; :func:`discretise` and :func:`advance` for loops with
+  constant params, and for all terms of the effort.
 - Params: :func:`make_params`, ``params.replace(...)``; :mod:`batchpid.gains.presets` for the
   tutorial's; :func:`save_params`, :func:`load_params`, :func:`dumps_params`, :func:`loads_params`.
 - Gains: :func:`design_gains` from a robot's inertia; :func:`stability_bound`.
@@ -35,10 +34,9 @@ from batchpid.gains.design import design_gains
 from batchpid.gains.stability import stability_bound
 from batchpid.io.documents import dumps_params, load_params, loads_params, save_params
 from batchpid.io.files import attributes_of
-from batchpid.law.bumpless import track
 from batchpid.law.coefficients import Coefficients, discretise
 from batchpid.law.params import PIDParams, make_params
-from batchpid.law.pid import advance, init, reset, step, step_terms
+from batchpid.law.pid import advance, init, reset, step, track
 from batchpid.law.state import PIDState, Terms
 from batchpid.motors import Actuators, load_actuators, make_actuators, save_actuators
 from batchpid.motors.guard import Guard, make_guard
@@ -81,7 +79,6 @@ __all__ = [
     "save_plan",
     "stability_bound",
     "step",
-    "step_terms",
     "track",
 ]
 

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array, Document
+from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import precision, require_jax
 from batchpid.law import pid
 from batchpid.law.coefficients import discretise
 from batchpid.law.params import PIDParams
-from batchpid.law.state import PIDState, Terms
+from batchpid.law.state import PIDState
 from batchpid.native.array_program import obstacle
 from batchpid.native.compiled import CompiledLaw
 
@@ -29,10 +29,8 @@ class NumPyBackend:
     Its coefficients are computed once; for NumPy they are spread over all envs.
     """
 
-    def __init__(self, dt: float, terms: bool, threads: int | None) -> None:
+    def __init__(self, dt: float) -> None:
         self.dt = dt
-        self.terms = terms
-        self.threads = threads
         self.native = not obstacle()
         """Whether the native extension computes the law, which then writes over the arrays of the
         state.
@@ -40,49 +38,34 @@ class NumPyBackend:
 
     def prepare(self, params: PIDParams, shape: tuple[int, int]) -> None:
         """Take params for (envs, joints) ``shape``."""
-        self.params, self.shape = params, shape
+        self.params = params
         self.coefficients = discretise(params, self.dt, 1 if self.native else shape[0])
-        self._law = (
-            CompiledLaw(self.coefficients, shape[0], self.terms, self.threads)
-            if self.native
-            else None
-        )
-
-    def __getstate__(self) -> Document:
-        return {**self.__dict__, "_law": None}
-
-    def __setstate__(self, state: Document) -> None:
-        """Build the native program again, if this process has the extension."""
-        self.__dict__.update(state)
-        self.native = not obstacle()
-        self.prepare(self.params, self.shape)
+        self._law = CompiledLaw(self.coefficients, shape[0]) if self.native else None
 
     def array(self, value: Array) -> Array:
         """Return ``value`` as an array of this backend."""
         return np.asarray(value, dtype=self.params.dtype)
 
-    def call(self, function: Callable[..., PIDState], *inputs: Array, **named: Array) -> PIDState:
-        """Return ``function(params, *inputs, **named)``: init, reset or track of the law."""
-        return function(self.params, *inputs, **named)
+    def call(self, function: Callable[..., PIDState], *inputs: Array) -> PIDState:
+        """Return ``function(params, *inputs)``: init or reset of the law."""
+        return function(self.params, *inputs)
 
     def step(
         self, state: PIDState, out: Array, *inputs: Array
-    ) -> tuple[PIDState, Array, Terms | None, Callable[..., Array]]:
-        """Return the new state, the effort, the terms if they are kept, and a fast call of the next
-        steps.
+    ) -> tuple[PIDState, Array, Callable[..., Array]]:
+        """Return the new state, the effort, and a fast call of the next steps.
 
         The effort is ``out``, if that is not None. The fast call takes ``out`` and the inputs and
         returns the effort, or NotImplemented. It may be used while the state is the new one and
         nobody else holds its arrays.
         """
         if self._law is not None:
-            state, effort, shown, fast = self._law.step(state, inputs, out)
-            return state, effort, shown, fast or declined
+            return self._law.step(state, inputs, out)
         new, terms = pid.advance(self.coefficients, state, *inputs)
-        if out is not None:
-            out[...] = terms.effort
-            terms = terms._replace(effort=out)
-        return new, terms.effort, terms.filled() if self.terms else None, declined
+        if out is None:
+            return new, terms.effort, declined
+        out[...] = terms.effort
+        return new, out, declined
 
 
 class JAXBackend:
@@ -92,19 +75,17 @@ class JAXBackend:
 
     native = False
 
-    def __init__(self, dt: float, terms: bool, threads: int | None) -> None:
+    def __init__(self, dt: float) -> None:
         require_jax()
         import jax
 
-        self.jax, self.terms = jax, terms
+        self.jax = jax
         self.dtype: Any = None
         self._compiled: dict[Any, Any] = {}
 
-        def step(
-            params: PIDParams, state: PIDState, *inputs: Array
-        ) -> tuple[PIDState, Array, Terms | None]:
-            new, results = pid.advance(discretise(params, dt), state, *inputs)
-            return new, results.effort, results.filled() if terms else None
+        def step(params: PIDParams, state: PIDState, *inputs: Array) -> tuple[PIDState, Array]:
+            new, terms = pid.advance(discretise(params, dt), state, *inputs)
+            return new, terms.effort
 
         self._step = jax.jit(step, donate_argnums=1)
 
@@ -121,12 +102,12 @@ class JAXBackend:
         # A copy: JAX may read it when the call has returned, and the caller writes to it.
         return np.array(value, dtype=self.dtype)
 
-    def call(self, function: Callable[..., PIDState], *inputs: Array, **named: Array) -> PIDState:
-        """Return ``function(params, *inputs, **named)``: init, reset or track of the law."""
+    def call(self, function: Callable[..., PIDState], *inputs: Array) -> PIDState:
+        """Return ``function(params, *inputs)``: init or reset of the law."""
         if function not in self._compiled:
             self._compiled[function] = self.jax.jit(function)
         with precision(self.dtype):
-            state: PIDState = self._compiled[function](self.params, *inputs, **named)
+            state: PIDState = self._compiled[function](self.params, *inputs)
             return state
 
     def step(
@@ -134,9 +115,7 @@ class JAXBackend:
         state: PIDState,
         out: Array,
         *inputs: Array,
-    ) -> tuple[PIDState, Array, Terms | None, Callable[..., Array]]:
-        """Return the new state, the effort, the terms if they are kept, and no fast call; ``out``
-        is None.
-        """
+    ) -> tuple[PIDState, Array, Callable[..., Array]]:
+        """Return the new state, the effort, and no fast call; ``out`` is None."""
         with precision(self.dtype):
             return *self._step(self.params, state, *inputs), declined

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array, Document
+from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import read_only
 from batchpid.arrays.records import frozen
+from batchpid.arrays.trees import mapped
 from batchpid.backends import JAXBackend, NumPyBackend, declined
 from batchpid.checks import (
     choice,
@@ -20,17 +20,16 @@ from batchpid.checks import (
     read_array,
     time_step,
 )
-from batchpid.errors import InvalidArgumentError
-from batchpid.law import bumpless, pid
+from batchpid.errors import InvalidArgumentError, SingleOwner
+from batchpid.law import pid
 from batchpid.law.params import PIDParams
-from batchpid.law.state import PIDState, Terms, check_alone
+from batchpid.law.state import PIDState, check_alone
 
 BACKENDS: dict[str, type[NumPyBackend | JAXBackend]] = {"numpy": NumPyBackend, "jax": JAXBackend}
 MOST_ENVS = 2**31
-MOST_THREADS = 1024
 
 
-class BatchPID:
+class BatchPID(SingleOwner):
     """PID controller of (num_envs, joints) loops that keeps its state between calls.
 
     It starts from the first measurement. Efforts are arrays of the backend, in the params' dtype,
@@ -48,18 +47,13 @@ class BatchPID:
         "numpy": computed by the native extension where that was built, with the bytes of NumPy but
         without its floating-point warnings. Or "jax": compiled once, with the state's buffers
         donated from call to call.
-    terms
-        Keep the :class:`batchpid.Terms` of the last call, at the cost of computing them.
     joint_names
         Used in error messages.
-    threads
-        Largest number of threads of the native extension, which uses them for large batches; None:
-        the cores that this process may use. The result does not depend on it.
 
     Raises
     ------
     InvalidArgumentError
-        Wrong backend, num_envs, dt, params or threads.
+        Wrong backend, num_envs, dt or params.
     MissingDependencyError
         Backend "jax" without JAX.
     """
@@ -71,9 +65,7 @@ class BatchPID:
         dt: float,
         backend: str = "numpy",
         *,
-        terms: bool = False,
         joint_names: Sequence[str] | None = None,
-        threads: int | None = None,
     ) -> None:
         # Sizes first: the params, the names and the engine are checked against them.
         self._backend, self._dt = choice("backend", backend, BACKENDS), time_step("dt", dt)
@@ -81,15 +73,10 @@ class BatchPID:
         self._names: list[str] | None = None
         if joint_names is not None:
             self._names = names("joint_names", joint_names, self.num_joints)
-        if threads is not None:
-            threads = integer("threads", threads, 1, MOST_THREADS)
-        self._track = partial(bumpless.track, dt=self._dt)
-        self._engine = BACKENDS[self._backend](self._dt, terms, threads)
+        self._engine = BACKENDS[self._backend](self._dt)
         self._state: PIDState | None = None
         self._fast = declined  # fast call of the law on this very state
-        self._lent = False  # whether someone else may hold arrays of the state
         self._stale = False  # whether the state may lack leaves that the params now need
-        self._terms: Terms | None = None
         self._params = params
         self.params = params
 
@@ -104,10 +91,6 @@ class BatchPID:
             f"BatchPID({envs} envs, {joints} joints, dt {self._dt:g} s, backend {backend},"
             f" {started})"
         )
-
-    def __getstate__(self) -> Document:
-        self._fast, self._lent = declined, True  # a shallow copy holds the same arrays
-        return self.__dict__.copy()
 
     @property
     def num_envs(self) -> int:
@@ -139,7 +122,7 @@ class BatchPID:
         """Params of the law. Assign others at any time: they are checked, and the state is kept.
 
         A change of ki, limits or times makes no bump, since the integral is an effort. A change of
-        kp or kd does, unless :meth:`track` follows it with the last effort.
+        kp or kd does; the pure functions have :func:`batchpid.track` for it.
         """
         return self._params
 
@@ -164,24 +147,11 @@ class BatchPID:
 
     @property
     def state(self) -> PIDState | None:
-        """State of the law, read-only; None before the first measurement. With JAX it is valid
-        until the next call.
-        """
-        self._fast, self._lent = declined, True
+        """Copy of the state of the law, read-only; None before the first measurement."""
         if self._state is None:
             return None
-        return PIDState(*map(read_only, self._state))
-
-    @property
-    def terms(self) -> Terms | None:
-        """Terms of the last call, read-only; None before the first."""
-        if not self._engine.terms:
-            raise InvalidArgumentError(
-                "terms", "are off", remedy="build the BatchPID with terms=True"
-            )
-        if self._terms is None:
-            return None
-        return Terms(*map(read_only, self._terms))
+        copied: PIDState = mapped(lambda leaf: read_only(leaf.copy()), self._state)
+        return copied
 
     def __call__(
         self,
@@ -215,21 +185,18 @@ class BatchPID:
         # All arguments are read before the state changes.
         r = self._array("setpoint", setpoint)
         y = self._array("measurement", measurement, exact=True)
-        rest = self._optional(
-            measurement_rate=measurement_rate,
-            setpoint_rate=setpoint_rate,
-            feedforward=feedforward,
-        )
+        rest = {
+            "measurement_rate": measurement_rate,
+            "setpoint_rate": setpoint_rate,
+            "feedforward": feedforward,
+        }
+        optional = [
+            None if value is None else self._array(name, value) for name, value in rest.items()
+        ]
         if out is not None:
             self._check_out(out)
         state = self._started(y)
-        # The native law writes into the arrays of the state, which a caller may hold.
-        if self._lent and self._engine.native:
-            state = PIDState(*(None if leaf is None else leaf.copy() for leaf in state))
-        self._state, effort, self._terms, self._fast = self._engine.step(
-            state, out, r, y, *rest.values()
-        )
-        self._lent = False
+        self._state, effort, self._fast = self._engine.step(state, out, r, y, *optional)
         return effort
 
     def reset(self, measurement: Array, mask: Array = None) -> None:
@@ -244,36 +211,6 @@ class BatchPID:
         self._fast = declined
         self._state = self._engine.call(pid.reset, self._started(y), y, mask)
 
-    def track(
-        self,
-        setpoint: Array,
-        measurement: Array,
-        effort: Array,
-        measurement_rate: Array = None,
-        setpoint_rate: Array = None,
-        feedforward: Array = None,
-    ) -> None:
-        """Make the next call on these same inputs return ``effort``: bumpless, as
-        :func:`batchpid.track`.
-        """
-        r = self._array("setpoint", setpoint)
-        y = self._array("measurement", measurement, exact=True)
-        u = self._array("effort", effort)
-        rest = self._optional(
-            measurement_rate=measurement_rate,
-            setpoint_rate=setpoint_rate,
-            feedforward=feedforward,
-        )
-        self._fast = declined
-        self._state = self._engine.call(
-            self._track,
-            self._started(y),
-            r,
-            y,
-            u,
-            **rest,
-        )
-
     def _started(self, y: Array) -> PIDState:
         """Return the state, begun at the first measurement, with every leaf that the params
         need.
@@ -284,12 +221,6 @@ class BatchPID:
             self._state = self._state.matched_to(self._engine.call(pid.init, y))
             self._stale = False
         return self._state
-
-    def _optional(self, **values: Array) -> Document:
-        return {
-            name: None if value is None else self._array(name, value)
-            for name, value in values.items()
-        }
 
     def _check_out(self, out: Array) -> None:
         if self._backend != "numpy":

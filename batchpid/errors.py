@@ -143,7 +143,7 @@ class CallOrderError(BatchPIDError, RuntimeError):
 
 
 class NotCopyableError(BatchPIDError, TypeError):
-    """The object owns processes or files, and can be neither copied nor pickled."""
+    """The object owns processes, files or native memory, and can be neither copied nor pickled."""
 
 
 class InUseError(BatchPIDError, RuntimeError):
@@ -170,8 +170,8 @@ class SingleOwner:
         """
         name = type(self).__name__
         raise NotCopyableError(
-            f"a {name} can be neither copied nor pickled, since it owns processes, scenes or files;"
-            f" {self.instead}"
+            f"a {name} can be neither copied nor pickled, since it owns processes, files or native"
+            f" memory; {self.instead}"
         )
 
 

@@ -85,12 +85,12 @@ def _fused(kp, ki_dt, kd, low, high, decay, intake, back, r, y, ff, integral, la
             last[at + i], rate[at + i], effort[at + i] = y[at + i], v, s
 
 
-def native_step(num_envs, dtype=np.float32, threads=None):
+def native_step(num_envs, dtype=np.float32):
     """Return a call of BatchPID by the native extension, which writes over the efforts of the call
     before last.
     """
     r, y0, y1, ff = inputs(num_envs, dtype)
-    pid, turn = bp.BatchPID(PARAMS.replace(dtype=dtype), num_envs, DT, threads=threads), [y0, y1]
+    pid, turn = bp.BatchPID(PARAMS.replace(dtype=dtype), num_envs, DT), [y0, y1]
     outs = [np.empty_like(r), np.empty_like(r)]
     if not pid.native:
         pytest.skip("there is no extension")
@@ -218,13 +218,22 @@ def test_step(benchmark, compare, most, best, found, kernel, num_envs):
 
 @pytest.mark.parametrize(("num_envs", "threads"), [(64, 1), (4096, 1), (2**20, 1), (2**20, 2)])
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_native_against_numpy_and_a_fused_pass(benchmark, compare, most, dtype, num_envs, threads):
+def test_native_against_numpy_and_a_fused_pass(
+    benchmark,
+    compare,
+    most,
+    dtype,
+    num_envs,
+    threads,
+    monkeypatch,
+):
     """Least times of rounds in turn: the law by the extension and by NumPy, and fused by hand on as
     many threads.
     """
     num_envs, threads = min(num_envs, most.rows), min(threads, numba.config.NUMBA_NUM_THREADS)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(threads))
     calls = {
-        "native": native_step(num_envs, dtype, threads),
+        "native": native_step(num_envs, dtype),
         "numpy": numpy_step(num_envs, dtype),
         "fused": fused_step(num_envs, dtype),
     }

@@ -59,8 +59,7 @@ def test_osc_step(benchmark, compare, most, num_envs, pose):
     qpos = POSES[pose] + 0.01 * rng.normal(size=(rows, tree.dof))
     qvel = 0.1 * rng.normal(size=qpos.shape)
     options = {"effort_limit": robot.effort_limit, "smallest_eigenvalue": SMALLEST_EIGENVALUE[pose]}
-    params = ts.make_osc_params(tree, **options)
-    k = ts.discretise(params, 1 / 2000)
+    params = ts.make_osc_params(tree, 1 / 2000, **options)
     state, goal = (
         ts.init(params, qpos),
         ts.link_poses(tree, qpos, [LINK])[:, 0] + [0.05, 0, 0, 0, 0, 0, 0],
@@ -72,7 +71,7 @@ def test_osc_step(benchmark, compare, most, num_envs, pose):
     )
 
     def step():
-        return ts.osc(k, state, tool, inputs)
+        return ts.osc(params, state, tool, inputs)
 
     near = step()[1].near_singular
     assert near.all() if pose == "bounded" else not near.any()
@@ -83,7 +82,7 @@ def test_osc_step(benchmark, compare, most, num_envs, pose):
     least = benchmark.stats.stats.min
     parts = {
         "dynamics": best(lambda: ts.task_dynamics(tree, qpos, qvel, LINK), seconds),
-        "law": best(lambda: ts.osc(k, state, d, inputs), seconds),
+        "law": best(lambda: ts.osc(params, state, d, inputs), seconds),
     }
     for name, time_of_part in {"step": least, **parts, "step in NumPy": in_numpy}.items():
         benchmark.extra_info[f"{name} [us]"] = 1e6 * time_of_part / rows

@@ -67,7 +67,7 @@ def first_sentence(text: str) -> str:
 
 
 ADVANCED = (
-    *("wrenches", "build", "backend", "speed_limit", "on_invalid_input", "first_env"),
+    *("wrenches", "build", "backend", "on_invalid_input", "first_env"),
     *("timeout", "cluster"),
 )
 """Options of the Runner that few programs need."""

@@ -1,4 +1,4 @@
-"""Follow a trajectory: to the tutorial's pose and back along a step, a trapezoid, and minimum jerk.
+"""Follow a trajectory: to the tutorial's pose and back along a step and minimum jerk.
 
     python examples/follow_trajectory.py
 
@@ -10,16 +10,17 @@ is to follow.
 import numpy as np
 
 from batchpid.sim import Robot, Runner
-from batchpid.trajectories import Trajectory, minimum_jerk, trapezoidal
+from batchpid.trajectories import Trajectory, minimum_jerk
 
 DT = 0.01  # a tick: 20 sim steps [s]
 
 
-def profiles(start, target, velocity, acceleration) -> dict[str, Trajectory]:
-    """Return the same move as three profiles, held at the end for 1 s or longer."""
-    limits = {"max_velocity": velocity, "max_acceleration": acceleration}
-    moves = {"trapezoidal": trapezoidal(start, target, DT, **limits)}
-    moves["minimum jerk"] = minimum_jerk(start, target, DT, **limits)
+def profiles(start, target, velocity) -> dict[str, Trajectory]:
+    """Return the same move at two speeds and as a step, held at the end for 1 s or longer."""
+    moves = {
+        name: minimum_jerk(start, target, DT, max_velocity=share * velocity)
+        for name, share in (("minimum jerk", 1.0), ("half as fast", 0.5))
+    }
     last = max(move.time[-1] for move in moves.values())
     still = np.broadcast_to(target, (1, len(target)))
     moves["step"] = Trajectory(np.array([DT]), still, 0 * still, 0 * still)
@@ -29,8 +30,7 @@ def profiles(start, target, velocity, acceleration) -> dict[str, Trajectory]:
 def main():
     """Run one robot per profile and print the errors of each."""
     robot = Robot.load("panda")
-    velocity = 0.5 * robot.velocity_limit
-    moves = profiles(robot.start, robot.target, velocity, acceleration=4 * velocity)
+    moves = profiles(robot.start, robot.target, 0.5 * robot.velocity_limit)
     ticks = min(move.ticks for move in moves.values())
     position, rate, acceleration = (
         np.stack([getattr(move, name)[:ticks] for move in moves.values()], axis=1)

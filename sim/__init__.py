@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from batchpid.sim.loop.arrays import Snapshot
     from batchpid.sim.loop.closed_loop import closed_loop
     from batchpid.sim.loop.faults import Fault, FaultWarning
-    from batchpid.sim.options.groups import Controller, Ray
+    from batchpid.sim.options.groups import Controller
     from batchpid.sim.options.options import RunnerOptions
     from batchpid.sim.randomization.distributions import Choice, LogUniform, Normal, Uniform
     from batchpid.sim.randomization.randomization import Randomization
@@ -51,7 +51,6 @@ __all__ = [
     "OperationalSpace",
     "Physics",
     "Randomization",
-    "Ray",
     "Recorder",
     "RecordingError",
     "RecoveryWarning",
@@ -87,7 +86,6 @@ _PLACES = {
     "OperationalSpace": "batchpid.sim.tool_space",
     "Physics": "batchpid.sim.engine.scene_spec",
     "Randomization": "batchpid.sim.randomization.randomization",
-    "Ray": "batchpid.sim.options.groups",
     "Recorder": "batchpid.sim.recording.recorder",
     "RecordingError": "batchpid.sim.recording.recording_files",
     "RecoveryWarning": "batchpid.sim.workers.pool",

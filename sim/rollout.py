@@ -337,6 +337,45 @@ class Rollout:
             **others,
         )
 
+    @staticmethod
+    def join(parts: Sequence[Rollout]) -> Rollout:
+        """Return successive rollouts of a runner as one, with the info of the first and the faults
+        of the last, which include the earlier ones.
+
+        Raises InvalidArgumentError for parts with other joints, envs or ticks, or that do not
+        follow each other.
+        """
+        first = parts[0]
+        time = np.concatenate([part.time for part in parts])
+        kinds = {(part.info.joint_names, part.num_envs, part.tick) for part in parts}
+        if len(kinds) > 1 or (np.abs(np.diff(time) - first.tick) > 1e-6 * first.tick).any():
+            problem = "are of other joints, envs or ticks, or do not follow each other"
+            remedy = "join the rollouts of one run, in their order"
+            raise InvalidArgumentError("parts", problem, remedy=remedy)
+        joined: dict[str, Any] = {}
+        for name in OPTIONAL:
+            tables = [getattr(part, name) for part in parts]
+            present = [table for table in tables if table is not None]
+            # A part without feedforward or changes has 0.
+            if present:
+                zero = np.zeros_like(present[0][:1])
+                for number, part in enumerate(parts):
+                    if tables[number] is None:
+                        tables[number] = np.repeat(zero, len(part.time), axis=0)
+                joined[name] = np.concatenate(tables)
+        return replace(
+            first,
+            time=time,
+            setpoint=np.concatenate([part.setpoint for part in parts]),
+            observation=Observation.join([part.observation for part in parts]),
+            info=replace(
+                first.info,
+                faults=parts[-1].info.faults,
+                rates=any(part.info.rates for part in parts),
+            ),
+            **joined,
+        )
+
     def __repr__(self) -> str:
         ticks, envs, dof = self.qpos.shape
         if ticks:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import copy
 from typing import Any
 
@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import Array
+from batchpid.arrays.array_types import Array, Document
 from batchpid.arrays.elementwise import namespace
-from batchpid.arrays.records import frozen, summary
+from batchpid.arrays.records import summary
 from batchpid.arrays.trees import digest
 from batchpid.checks import array, choice, flag, instance, names
 from batchpid.errors import InvalidArgumentError, warn
@@ -63,8 +63,7 @@ class OperationalSpace:
         without the error r w^2/kp. Pose, twist and acceleration are those at the end of the tick;
         before that the pose moves with the twist. Without twist the pose is constant in the tick.
     wrench
-        Whether setpoints give the wrench of the tool on its surroundings (N and N m), in the axes
-        of the params' frame.
+        Whether setpoints give the wrench of the tool on its surroundings (N and N m).
     joints
         Joints outside the chain to the link, such as fingers, whose positions are part of the
         setpoint; others hold their posture.
@@ -108,17 +107,16 @@ class OperationalSpace:
         self._posture = robot.coupling.positions(
             array("posture", posture, (1, tree.dof), tree.joint_names)
         )
-        if options.keys().isdisjoint(("effort_limit", "effort_min", "effort_max")):
-            options["effort_limit"] = robot.effort_limit
-        params = ts.make_osc_params(tree, **options)
-        for name, leaf in params._asdict().items():
-            if isinstance(leaf, np.ndarray) and len(leaf) > 1:
-                problem = f"has rows for {len(leaf)} envs"
+        for name, rows in options.items():
+            if np.ndim(rows) > 1 and len(rows) > 1:
+                problem = f"has rows for {len(rows)} envs"
                 remedy = "give one row for all envs"
                 raise InvalidArgumentError(name, problem, remedy=remedy)
-        self._params = frozen(params)
+        self._options: Document = {"effort_limit": robot.effort_limit} | options
+        self.implicit = self._options.get("discretization") == "implicit"
+        """Whether the gains are implicit."""
         self._timestep = 1 / 2000
-        self._k = ts.discretise(self._params, self._timestep)
+        self._k = ts.make_osc_params(tree, self._timestep, **self._options)
         # Coulomb friction, and the band of errors in which it is reduced.
         self._friction: tuple[Array, Array] | None = None
         # Damping and friction that the robot is known to have: the law acts against them.
@@ -156,23 +154,15 @@ class OperationalSpace:
             neutral.append(self._posture[0, joint])
         self.command = CommandSpec(tuple(entries), tuple(entries.values()), neutral=neutral)
         """Names and units of a setpoint; the neutral one is the pose of the posture."""
-
-    @property
-    def params(self) -> ts.OSCParams:
-        """Params of the law, one row for all envs, read-only."""
-        return self._params
-
-    @property
-    def version(self) -> str:
-        """Digest of all that the law depends on, besides the robot."""
-        return digest(
+        self.version = digest(
             self.link,
             self.point,
             self._posture,
-            self._params,
+            self._k,
             self.tree,
             self.command.names,
         )
+        """Digest of all that the law depends on, besides the robot and the time step."""
 
     def __repr__(self) -> str:
         return summary(
@@ -191,7 +181,7 @@ class OperationalSpace:
             problem = f"was made for the joints {', '.join(self.tree.joint_names)}"
             remedy = "make it for the robot of the runner"
             raise InvalidArgumentError("control", problem, remedy=remedy)
-        return ts.init(self._params, np.repeat(self._posture, num_envs, axis=0))
+        return ts.init(self._k, np.repeat(self._posture, num_envs, axis=0))
 
     def __call__(
         self,
@@ -206,19 +196,9 @@ class OperationalSpace:
         ``setpoint`` is taken as it is: within a tick the pose moves only where this method is not
         overridden.
         """
-        return self._advance(state, setpoint, qpos, qvel, passive)[:2]
+        return self.advance(state, setpoint, qpos, qvel, passive)[:2]
 
-    @property
-    def reporting(self) -> Callable[..., tuple[Array, Array, Array]] | None:
-        """Call that also returns the joints (envs, dof) whose effort the limits have changed.
-
-        None in a subclass that defines ``__call__``.
-        """
-        if type(self).__call__ is OperationalSpace.__call__:
-            return self._advance
-        return None
-
-    def _advance(
+    def advance(
         self,
         state: ts.OSCState,
         setpoint: Array,
@@ -227,6 +207,9 @@ class OperationalSpace:
         passive: Array,
         left: Array = 0.0,
     ) -> tuple[Array, Array, Array]:
+        """Return state and efforts ``left`` [s] before the end of the tick, and the joints (envs,
+        dof) whose effort the limits have changed.
+        """
         xp = namespace(setpoint, qpos)
         setpoint = self._carried(setpoint, left)
         posture = state.posture
@@ -341,21 +324,18 @@ class OperationalSpace:
         runner.
         """
         other = copy(self)
-        other._k = ts.discretise(self._params, timestep)
+        other._k = ts.make_osc_params(self.tree, timestep, **self._options)
         other._timestep = timestep
         other._friction = self._known_friction if "friction" in compensate.split("+") else None
         return other
 
     def check_stability(self) -> None:
         """Warn if explicit gains are unstable at the time step: kp dt^2 + 2 kd dt > 4."""
-        params, dt = self._params, self._timestep
-        # An implicit law is stable at any time step.
-        if params.discretization is not None:
-            return
-        joints = self.tree.joint_names
+        k, dt = self._k, self._timestep
+        # The coefficients of implicit gains are below the bound at any time step.
         for name, kp, kd, columns in (
-            ("stiffness", params.stiffness, params.damping, AXES),
-            ("posture_stiffness", params.posture_stiffness, params.posture_damping, joints),
+            ("stiffness", k.kp, k.kd, AXES),
+            ("posture_stiffness", k.posture_kp, k.posture_kd, self.tree.joint_names),
         ):
             ratio = (kp * dt * dt + 2 * kd * dt)[0] / 4
             worst = int(ratio.argmax())

@@ -68,18 +68,16 @@ class NamedChoice(NamedTuple):
         return hash(type(self))
 
 
-class Everywhere(NamedChoice):
-    """An option that may be chosen per joint and env is on for all of them, so no mask is
-    needed.
-    """
+class Clamp(NamedChoice):
+    """The integral is limited, to the effort limits unless it has its own."""
 
 
-class ZeroEffort(NamedChoice):
-    """A joint with a non-finite input gets effort 0."""
+class Conditional(NamedChoice):
+    """The integral does not grow further into saturation."""
 
 
-class HoldEffort(NamedChoice):
-    """A joint with a non-finite input gets its last effort again."""
+class BackCalculation(NamedChoice):
+    """The integral follows the saturated effort."""
 
 
 class MeasuredRate(NamedChoice):
@@ -99,14 +97,18 @@ class ImplicitLaw(NamedChoice):
 
 
 CHOICES: dict[str, Document] = {
-    "non_finite": {"propagate": None, "zero": ZeroEffort(), "hold": HoldEffort()},
+    "anti_windup": {
+        "none": None,
+        "clamp": Clamp(),
+        "conditional": Conditional(),
+        "back_calculation": BackCalculation(),
+    },
     "measurement_rate": {"difference": None, "measured": MeasuredRate()},
     "gain_units": {"effort": None, "mass_matrix": PerMassMatrix()},
     "discretization": {"explicit": None, "implicit": ImplicitLaw()},
 }
 """Options chosen by name, and what each name puts into the params; the first is the default."""
-CHOICE_TYPES: tuple[type, ...] = (
-    Everywhere,
-    *(type(one) for named in CHOICES.values() for one in named.values() if one is not None),
+CHOICE_TYPES: tuple[type, ...] = tuple(
+    type(one) for named in CHOICES.values() for one in named.values() if one is not None
 )
 """Types that a choice can have in the params."""

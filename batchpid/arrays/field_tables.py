@@ -123,14 +123,14 @@ def plain(name: str, kind: Kind, value: Any) -> Any:
     else:
         kind, *metadata = (kind,)
     bounds = next((one for one in metadata if isinstance(one, Field)), Field(low=-math.inf))
-    if get_origin(kind) is Literal:
-        return choice(name, value, get_args(kind))
     # None is allowed where the type says so; a union of more is checked elsewhere.
     if NoneType in get_args(kind):
         kinds = [one for one in get_args(kind) if one is not NoneType]
         if value is None or len(kinds) > 1:
             return value
         (kind,) = kinds
+    if get_origin(kind) is Literal:
+        return choice(name, value, get_args(kind))
     if kind is bool:
         return flag(name, value)
     if kind is int:

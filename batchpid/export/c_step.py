@@ -341,7 +341,7 @@ def plan_functions(c: Dialect, plan: Plan, functions: str) -> str:
             places,
         )
 
-    row = [f"chunk[k * {n} + j]", "begin", "offset[j]", "slope[j]", "first", "step", "rows"]
+    row = [f"chunk[k * {n} + j]", "begin", "offset[j]", "slope[j]", "first", "step"]
     knots = ["length", "position[j]", "blended[f][j]", "speed[j]", "state->rates[j][f]"]
     text = c.translated(
         "c_plan.h",

@@ -12,12 +12,12 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from batchpid.arrays.array_types import Bool, Document, Float64
+from batchpid.arrays.array_types import Bool, Conditional, Document, Float64
 from batchpid.checks import array, at_least, instance, names, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.coefficients import as_explicit
 from batchpid.law.computed_torque import check_gain_units
-from batchpid.law.params import LAW_FIELDS, PIDParams, strategy_names
+from batchpid.law.params import LAW_FIELDS, PIDParams
 from batchpid.motors.actuators import ACTUATOR_FIELDS, Actuators
 
 
@@ -60,11 +60,6 @@ DIFFERENCES = (
         "errors are not taken the short way round",
     ),
     Difference(
-        "non_finite",
-        "the effort is NaN, or not written, after an input that is not finite",
-        "inputs are not checked",
-    ),
-    Difference(
         "effort_limit",
         "u_clamp limits the PID alone, not its sum with a feedforward such as gravity compensation",
         "",
@@ -92,7 +87,6 @@ NEUTRAL = {
     name: float(field.neutral)
     for fields in (LAW_FIELDS, ACTUATOR_FIELDS)
     for name, field in fields.items()
-    if name != "anti_windup"
 }
 """Value of each option with which it is off."""
 
@@ -127,28 +121,17 @@ class Law(NamedTuple):
     """Differences by the conversion to this law."""
 
     def column(self, option: str) -> Float64:
-        """Return an option of the law or its motors (joints,), neutral where it is off; 1 for a
-        choice that is on.
-        """
+        """Return an option of the law or its motors (joints,), neutral where it is off."""
         record = self.params if option in self.params._fields else self.actuators
         leaf = getattr(record, option)
         if leaf is None:
-            return np.full(len(self.joints), NEUTRAL.get(option, 0.0))
-        if isinstance(leaf, tuple):
-            return np.ones(len(self.joints))
+            return np.full(len(self.joints), NEUTRAL[option])
         return np.asarray(leaf[0], np.float64)
 
     def has(self, option: str) -> Bool:
         """Return the mask of the joints at which an option is on."""
-        mask: Bool = self.column(option) != NEUTRAL.get(option, 0.0)
+        mask: Bool = self.column(option) != NEUTRAL[option]
         return mask
-
-    @property
-    def strategies(self) -> list[str]:
-        """Strategy of anti-windup of each joint, by the names of make_params."""
-        params = self.params
-        rows = strategy_names(params.num_joints, params.tracking_time, params.conditional)
-        return [str(strategy) for strategy in rows[0]]
 
     @property
     def effort_range(self) -> Float64:
@@ -251,14 +234,13 @@ def _conditions(law: Law) -> dict[str, Bool]:
     derives = law.has("kd")
     limited = law.has("effort_min") | law.has("effort_max")
     excludes = (law.column("effort_min") > 0) | (law.column("effort_max") < 0)
-    strategy = np.array(law.strategies)
-    tracks = strategy == "back_calculation"
+    tracks = law.has("tracking_time")
     return {
         "weighs": derives & (params.setpoint_weight_derivative is not None),
         "differentiates": derives & (params.measurement_rate is None),
         "limited": limited,
         "begins_outside": (law.column("integral_min") > 0) | (law.column("integral_max") < 0),
-        "misled": (strategy == "conditional") & excludes,
+        "misled": isinstance(params.anti_windup, Conditional) & excludes,
         "only_tracks": tracks & ~integrates,
         "left_out": tracks & integrates & limited,
         "early": tracks & (law.column("tracking_time") < law.dt),

@@ -22,7 +22,7 @@ from collections.abc import Sequence
 
 from numpy.typing import ArrayLike
 
-from batchpid.arrays.array_types import Document
+from batchpid.arrays.array_types import Conditional, Document
 from batchpid.export.differences import Exported, Law, differences, export_law
 from batchpid.io import documents
 from batchpid.law.params import LAW_FIELDS, PIDParams
@@ -109,13 +109,12 @@ def _gains(law: Law, at: int) -> Document:
     # control_toolbox refuses limits that exclude 0.
     gains["i_clamp_min"] = min(gains["i_clamp_min"], 0.0)
     gains["i_clamp_max"] = max(gains["i_clamp_max"], 0.0)
-    strategy = law.strategies[at]
-    tracks = strategy == "back_calculation"
-    if strategy == "conditional":
-        strategy = "conditional_integration"
-    gains["antiwindup_strategy"] = strategy
+    gains["antiwindup_strategy"] = "none"
     gains["tracking_time_constant"] = 0.0
-    if tracks:
+    if isinstance(params.anti_windup, Conditional):
+        gains["antiwindup_strategy"] = "conditional_integration"
+    if law.has("tracking_time")[at]:
+        gains["antiwindup_strategy"] = "back_calculation"
         gains["tracking_time_constant"] = documents.plain(params.tracking_time[:, at])
     weight = params.setpoint_weight_derivative
     gains["ff_velocity_scale"] = 0.0

@@ -2,11 +2,11 @@
 
 A file of params has this form; the keys are the options of :func:`batchpid.make_params`::
 
-    format: batchpid-params-1
+    format: batchpid-params-2
     dtype: float64
-    non_finite: propagate
+    anti_windup: conditional
     joints:
-      shoulder: {kp: 40.0, ki: 5.0, kd: 2.0, effort_max: 87.0, anti_windup: conditional}
+      shoulder: {kp: 40.0, ki: 5.0, kd: 2.0, effort_max: 87.0}
       elbow: {kp: 20.0, ki: 5.0, kd: 2.0}
 """
 
@@ -45,7 +45,7 @@ class RecordFile(Generic[R]):
     """
 
     format: str
-    """Name and version of the form, as in "batchpid-params-1"."""
+    """Name and version of the form, as in "batchpid-params-2"."""
     record: type[R]
     make: Callable[..., R]
     """Constructor of the records."""
@@ -226,7 +226,7 @@ def _column(
             problem = f"has {len(values)} values, others {envs}"
             raise error(source, name, problem, "give one per env", joint)
     rows = [values * (envs // len(values)) for values in columns.values()]
-    return np.array(rows, dtype=object if kind is str else kind).T
+    return np.array(rows, dtype=kind).T
 
 
 def read(path: str | os.PathLike[str]) -> Any:
@@ -338,7 +338,7 @@ def _parse_yaml(text: str) -> Any:
 
 
 PARAMS = RecordFile(
-    "batchpid-params-1",
+    "batchpid-params-2",
     PIDParams,
     make_params,
     ("dtype", *CHOICES),

@@ -3,10 +3,6 @@ mass matrix.
 """
 
 from batchpid.law.coefficients import as_explicit
-from batchpid.law.computed_torque import (
-    advance_with_mass_matrix,
-    check_gain_units,
-    convert_integral,
-)
+from batchpid.law.computed_torque import advance_with_mass_matrix, check_gain_units
 
-__all__ = ["advance_with_mass_matrix", "as_explicit", "check_gain_units", "convert_integral"]
+__all__ = ["advance_with_mass_matrix", "as_explicit", "check_gain_units"]

@@ -28,8 +28,8 @@ it is stable in continuous time. The explicit law with kp = w^2 and kd = 2 w is 
 
 - Setpoint: r is the position for the end of the step. The explicit law takes it for the beginning,
   and leads by dt r'.
-- Integral: the state is I / D, the acceleration that it contributes. Its limits, anti-windup and
-  bumpless transfer work as in the explicit law. The part 2 dt ki of kp* is outside of its limits.
+- Integral: the state is I / D, the acceleration that it contributes. Its limits and anti-windup
+  work as in the explicit law. The part 2 dt ki of kp* is outside of its limits.
 - Saturation: limits act on u as before. The prediction assumes that a is delivered.
 - Dead zone: P and I see the error less the zone; the predicted motion dt v damps within it, too.
 - Rate: v is the measured rate or the difference of positions, which is the same under semi-implicit
@@ -90,13 +90,11 @@ class Coefficients(NamedTuple):
     """dt / Tt, at most 1. Above 1, a step would correct more than the whole excess, and
     oscillate.
     """
-    conditional: Array
-    """Everywhere(), or 1.0 on the joints that have it."""
+    anti_windup: NamedChoice | None
     turns: Array
     """1 / (2 pi) on continuous joints, 0 elsewhere."""
     tiny: Array
     """Argument of :func:`batchpid.arrays.elementwise.flush`."""
-    non_finite: NamedChoice | None
     measurement_rate: Array
     gain_units: NamedChoice | None
     """Unit of gains that :mod:`batchpid.law.computed_torque` turns into efforts; the law alone

@@ -34,7 +34,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from batchpid.arrays.array_types import Array, ArrayModule, Everywhere, PerMassMatrix
+from batchpid.arrays.array_types import Array, ArrayModule, Conditional, PerMassMatrix
 from batchpid.arrays.elementwise import clip, in_dtype_of, matrix_vector, namespace, row_minimum
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.coefficients import Coefficients
@@ -101,51 +101,13 @@ def given_acceleration(k: Coefficients, setpoint_acceleration: Array) -> Array:
 
 
 def check_gain_units(params: PIDParams) -> None:
-    """Raise InvalidArgumentError for options that have no meaning for accelerations.
-
-    With gain_units "mass_matrix" these are back-calculation and a policy for non-finite inputs.
+    """Raise InvalidArgumentError for back-calculation with gain_units "mass_matrix": it has no
+    meaning for accelerations.
     """
-    instead = {
-        "tracking_time": "anti_windup 'conditional'",
-        "non_finite": "non_finite 'propagate'",
-    }
-    for option, remedy in instead.items():
-        if isinstance(params.gain_units, PerMassMatrix) and getattr(params, option) is not None:
-            problem = "is not available with gain_units 'mass_matrix'"
-            raise InvalidArgumentError(
-                option, problem, remedy=f"use {remedy}, or gain_units 'effort'"
-            )
-
-
-def convert_integral(
-    state: PIDState,
-    old: PIDParams,
-    new: PIDParams,
-    mass_matrix: Array,
-) -> PIDState:
-    """Return ``state`` with the integral I in the unit that ``new`` has, for a bumpless change of
-    gain_units.
-
-    I is an acceleration with gain_units "mass_matrix" and an effort otherwise: an effort becomes
-    M^-1 I, an acceleration M I. The integral limits of ``new`` hold.
-
-    Parameters
-    ----------
-    old, new
-        Params before and after the change.
-    mass_matrix
-        (envs, joints, joints) at the present positions [kg m^2 or kg].
-    """
-    was, becomes = (isinstance(params.gain_units, PerMassMatrix) for params in (old, new))
-    if state.integral is None or was == becomes:
-        return state
-    (mass_matrix,) = in_dtype_of(new, mass_matrix)
-    xp = namespace(state.integral, mass_matrix)
-    if was:
-        integral = matrix_vector(mass_matrix, state.integral)
-    else:
-        integral = xp.linalg.solve(mass_matrix, state.integral[..., None])[..., 0]
-    return state._replace(integral=clip(integral, new.integral_min, new.integral_max, xp))
+    if isinstance(params.gain_units, PerMassMatrix) and params.tracking_time is not None:
+        problem = "'back_calculation' is not available with gain_units 'mass_matrix'"
+        remedy = "use anti_windup 'conditional', or gain_units 'effort'"
+        raise InvalidArgumentError("anti_windup", problem, remedy=remedy)
 
 
 def _unlimited(k: Coefficients) -> Coefficients:
@@ -174,7 +136,7 @@ def _to_effort(
     demand = matrix_vector(mass_matrix, a)
     passive = 0.0 if feedforward is None else feedforward
     effort = unsaturated = demand + passive
-    stops = k.ki_dt is not None and k.conditional is not None
+    stops = k.ki_dt is not None and isinstance(k.anti_windup, Conditional)
     change = new.integral - old.integral if stops else None
     deeper = None
     if low is not None or high is not None:
@@ -196,8 +158,6 @@ def _to_effort(
             late = (reached - effort) * change > 0
         deeper = late if deeper is None else deeper | late
     if deeper is not None:
-        if not isinstance(k.conditional, Everywhere):
-            deeper = deeper & (k.conditional > 0)
         new = new._replace(integral=xp.where(deeper, old.integral, new.integral))
     return new, effort, unsaturated
 

@@ -17,22 +17,19 @@ import numpy as np
 from batchpid.arrays.array_types import (
     CHOICES,
     Array,
-    Bool,
+    BackCalculation,
+    Clamp,
     Document,
     DType,
-    Everywhere,
     NamedChoice,
     PerMassMatrix,
-    Rows,
 )
 from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.field_tables import Field, declared
-from batchpid.arrays.records import Ends, LeafBuilder, Record, is_everywhere, with_fields
-from batchpid.checks import choice, entries, is_traced
+from batchpid.arrays.records import LeafBuilder, Record, with_fields
+from batchpid.checks import choice, is_traced
 from batchpid.errors import InvalidArgumentError
 
-ANTI_WINDUP = ("none", "clamp", "conditional", "back_calculation")
-"""Strategies of anti-windup."""
 DEFAULTS = {name: next(iter(chosen)) for name, chosen in CHOICES.items()}
 """Default of each choice."""
 GAINS = ("kp", "ki", "kd")
@@ -61,15 +58,11 @@ class _ParamsFields(NamedTuple):
     setpoint_weight_derivative: Annotated[Array, Field("1")] = None
     deadband: Annotated[Array, Field("rad or m")] = None
     tracking_time: Annotated[Array, Field("s", math.inf)] = None
-    """inf on a joint without back-calculation."""
-    conditional: Array | NamedChoice | None = None
-    """Conditional integration: Everywhere(), or 1.0 on the joints that have it, 0.0 on the
-    others.
-    """
+    """inf: the integral of that joint does not track."""
     continuous: Annotated[Array, Field(neutral=False)] = None
     """1.0 on the joints whose position is an angle modulo 2 pi, 0.0 on the others."""
-    non_finite: NamedChoice | None = None
-    """ZeroEffort() or HoldEffort(); off: non-finite values propagate."""
+    anti_windup: NamedChoice | None = None
+    """Clamp(), Conditional() or BackCalculation()."""
     measurement_rate: NamedChoice | None = None
     """MeasuredRate(): the caller passes the measured rate; off: the law takes differences of
     measurements.
@@ -82,7 +75,7 @@ class _ParamsFields(NamedTuple):
     """ImplicitLaw(): the law acts on the predicted end of the step; off: on its beginning."""
 
 
-LAW_FIELDS = declared(_ParamsFields, Field) | {"anti_windup": Field(neutral="none")}
+LAW_FIELDS = declared(_ParamsFields, Field)
 """Options of a joint."""
 
 
@@ -102,9 +95,6 @@ class PIDParams(Record, _ParamsFields):
     def options(self) -> Document:
         """Return the options that are on, as arguments of :func:`make_params` that build these
         params again.
-
-        "clamp" shows as the integral limits that it sets. Where its leaves are traced, anti_windup
-        is left out.
         """
         options: Document = {}
         for name, leaf in self.leaves().items():
@@ -115,10 +105,6 @@ class PIDParams(Record, _ParamsFields):
             (options[name],) = (text for text, entry in chosen.items() if type(entry) is kind)
         if self.continuous is not None:
             options["continuous"] = options["continuous"] > 0
-        if not is_traced(self.tracking_time) and not is_traced(self.conditional):
-            options["anti_windup"] = strategy_names(
-                self.num_joints, self.tracking_time, self.conditional
-            )
         return {**options, "dtype": np.dtype(self.dtype)}
 
     def replace(self, **options: object) -> PIDParams:
@@ -131,22 +117,10 @@ class PIDParams(Record, _ParamsFields):
                 present.pop(f"{end}_max", None)
         if any(is_traced(value) for value in options.values()):
             del present["dtype"]
-        is_read = "anti_windup" in options or "anti_windup" in present
-        if "anti_windup" in options or not is_read:
+        # The time constant belongs to the strategy that stands.
+        if "anti_windup" in options:
             present.pop("tracking_time", None)
-        params = make_params(self.num_joints, **present | options)
-        if is_read:
-            return params
-        # The strategies are traced, and cannot be read: their leaves stay.
-        arrays = self.leaves()
-        for name in ("tracking_time", "conditional"):
-            if name in arrays:
-                leaf = arrays[name].astype(params.dtype)
-            else:
-                leaf = getattr(self, name)
-            params = params._replace(**{name: leaf})
-        params.check(params.num_envs)
-        return params
+        return make_params(self.num_joints, **present | options)
 
 
 @with_fields(*LAW_FIELDS, *DEFAULTS)
@@ -158,7 +132,6 @@ def make_params(
     *,
     effort_limit: Array = None,
     integral_limit: Array = None,
-    anti_windup: str | Sequence[object] = "none",
     joint_names: Sequence[str] | None = None,
     dtype: DType = None,
     **options: Array,
@@ -196,18 +169,14 @@ def make_params(
         to the zone.
     anti_windup
         "none", "clamp" (limit the integral, to the effort limits unless integral limits are given),
-        "conditional" (do not integrate further into saturation) or "back_calculation"; or a nested
-        list of these of shape (joints,) or (envs, joints).
+        "conditional" (do not integrate further into saturation) or "back_calculation".
     tracking_time
         Time constant of back-calculation [s]; one below the time step corrects the whole excess in
-        one step. None: sqrt(kd/ki), or kp/ki without kd (K. J. Astrom and T. Hagglund, Advanced PID
+        one step, inf none of it. None: sqrt(kd/ki), or kp/ki without kd (K. J. Astrom and T. Hagglund, Advanced PID
         Control, 2006, sec. 3.5).
     continuous
         Bools: joints whose position is an angle modulo 2 pi [rad]; errors and differences take the
             short way round.
-    non_finite
-        What to do with a joint whose input is NaN or inf: "propagate" it (no check, no cost), or
-        keep the state and command "zero" effort, or "hold" the last effort.
     measurement_rate
         Rate of the measurement that the derivative uses: "difference" of successive measurements,
         or "measured": the velocity that :class:`batchpid.sim.Runner` reads from the simulator. The
@@ -250,25 +219,19 @@ def make_params(
             leaves["kd"] = build.array("kd", 0.0, LAW_FIELDS["kd"])
     effort = build.limits("effort_limit", "effort_min", "effort_max", options)
     integral = build.limits("integral_limit", "integral_min", "integral_max", options)
-    # The joints may have different strategies: each becomes an array of the joints that use it, or
-    # None for none.
-    clamp, conditional, back = _masks(build, anti_windup)
-    if clamp is not None and all(end is None for end in integral):
-        integral = _clamped(clamp, effort)
+    if isinstance(leaves["anti_windup"], Clamp) and all(end is None for end in integral):
+        if all(end is None for end in effort):
+            problem = "'clamp' has no limit to clamp the integral to"
+            remedy = "give integral_limit or effort_limit"
+            raise InvalidArgumentError("anti_windup", problem, remedy=remedy)
+        integral = effort
     leaves |= dict(zip(ENDS, (*effort, *integral), strict=True))
-    time = _tracking_leaf(
-        build, options.get("tracking_time"), back, *[leaves[name] for name in GAINS]
-    )
-    is_everywhere = conditional is not None and conditional.all()
+    leaves["tracking_time"] = _tracking_time(build, options.get("tracking_time"), leaves)
+    leaves["continuous"] = build.mask("continuous", options.get("continuous"))
     # A choice is not an array.
-    for name in LAW_FIELDS & leaves.keys():
+    for name in LAW_FIELDS:
         leaves[name] = build.freeze(leaves[name])
-    return PIDParams(
-        **leaves,
-        tracking_time=time,
-        conditional=Everywhere() if is_everywhere else build.freeze(conditional),
-        continuous=build.mask("continuous", options.get("continuous")),
-    )
+    return PIDParams(**leaves)
 
 
 def _check_implicit(gain_units: NamedChoice | None, filter_time: Array) -> None:
@@ -287,85 +250,16 @@ def _check_implicit(gain_units: NamedChoice | None, filter_time: Array) -> None:
         raise InvalidArgumentError("derivative_filter_time", problem, remedy=remedy)
 
 
-def _masks(build: LeafBuilder, names: str | Sequence[object]) -> list[Bool | None]:
-    """Return the masks of clamp, conditional and back-calculation, each None where no joint has
-    it.
-
-    Raises InvalidArgumentError for names that are not among ANTI_WINDUP, or of a wrong shape.
-    """
-    remedy = f"use one of {', '.join(map(repr, ANTI_WINDUP))}"
-    try:
-        array = np.asarray(names, dtype=object)
-    except (TypeError, ValueError, RuntimeError) as error:
-        problem = f"cannot be read as an array: {error}"
-        raise InvalidArgumentError("anti_windup", problem, remedy=remedy) from None
-    array = build.rows("anti_windup", array)
-    good = np.array([isinstance(name, str) and name in ANTI_WINDUP for name in array.flat], bool)
-    good = good.reshape(array.shape)
-    entries(
-        "anti_windup",
-        array,
-        good,
-        "unknown option",
-        build.names,
-        remedy=remedy,
-    )
-    # "none" needs no mask: it is where the others are not.
-    joints = [array == strategy for strategy in ANTI_WINDUP[1:]]
-    return [mask if mask.any() else None for mask in joints]
-
-
-def strategy_names(
-    joints: int, tracking_time: Array, conditional: Array | NamedChoice | None
-) -> Rows:
-    """Return the strategies (1 | envs, joints) by name, from the leaves of params."""
-    # A joint has one strategy, so later marks cannot meet earlier ones.
-    names: Rows = np.full((1, joints), "none", dtype=object)
-    if tracking_time is not None:
-        names = np.where(np.isfinite(tracking_time), "back_calculation", names)
-    if conditional is not None:
-        chosen = isinstance(conditional, Everywhere) or np.asarray(conditional) > 0
-        names = np.where(chosen, "conditional", names)
-    return names
-
-
-def _clamped(clamp: Bool, effort: Ends) -> Ends:
-    """Return the limits of an integral for which none are given: the effort limits on the joints
-    of the mask ``clamp``.
-    """
-    if all(end is None for end in effort):
-        problem = "'clamp' has no limit to clamp the integral to"
-        remedy = "give integral_limit or effort_limit"
-        raise InvalidArgumentError("anti_windup", problem, remedy=remedy)
-    low, high = effort
-    if low is not None:
-        low = namespace(low).where(clamp, low, -math.inf)
-    if high is not None:
-        high = namespace(high).where(clamp, high, math.inf)
-    return low, high
-
-
-def _tracking_leaf(
-    build: LeafBuilder,
-    value: Array,
-    back: Bool | None,
-    kp: Array,
-    ki: Array,
-    kd: Array,
-) -> Array:
-    """Return the leaf of back-calculation's time constant, inf where a joint is not ``back``."""
-    if back is None:
-        if value is not None:
-            problem = "is given, but no joint has anti_windup 'back_calculation'"
-            remedy = "choose that strategy or leave tracking_time out"
-            raise InvalidArgumentError("tracking_time", problem, remedy=remedy)
-        return None
-    time = build.array("tracking_time", value, Field("s", math.inf))
-    time = _rule_of_thumb(kp, ki, kd) if time is None else time
-    time = namespace(time).where(back, time, math.inf)
-    if is_everywhere(time, math.inf):
-        return None
-    return build.freeze(time)
+def _tracking_time(build: LeafBuilder, value: Array, leaves: Document) -> Array:
+    """Return the time constant of back-calculation, None without it."""
+    if isinstance(leaves["anti_windup"], BackCalculation):
+        time = build.array("tracking_time", value, LAW_FIELDS["tracking_time"])
+        return _rule_of_thumb(*[leaves[name] for name in GAINS]) if time is None else time
+    if value is not None:
+        problem = "is given, but anti_windup is not 'back_calculation'"
+        remedy = "choose that strategy or leave tracking_time out"
+        raise InvalidArgumentError("tracking_time", problem, remedy=remedy)
+    return None
 
 
 def _rule_of_thumb(kp: Array, ki: Array, kd: Array) -> Array:

@@ -29,7 +29,7 @@ b) / ki.
 
 from __future__ import annotations
 
-from batchpid.arrays.array_types import Array, ArrayModule, Everywhere, HoldEffort
+from batchpid.arrays.array_types import Array, ArrayModule, Conditional
 from batchpid.arrays.elementwise import (
     clip,
     flush,
@@ -39,6 +39,8 @@ from batchpid.arrays.elementwise import (
     replace_envs,
     wrap,
 )
+from batchpid.checks import instance
+from batchpid.errors import InvalidArgumentError
 from batchpid.law.coefficients import Coefficients, discretise
 from batchpid.law.params import PIDParams
 from batchpid.law.state import (
@@ -118,39 +120,37 @@ def step(
         params need, or the params have gain_units other than "effort" or ask for a measured rate
         that is not given.
     """
-    state, terms = _step(
-        params,
-        state,
-        setpoint,
-        measurement,
-        dt,
-        measurement_rate=measurement_rate,
-        setpoint_rate=setpoint_rate,
-        feedforward=feedforward,
-    )
+    rest = measurement_rate, setpoint_rate, feedforward
+    state, terms = _step(params, state, setpoint, measurement, dt, *rest)
     return state, terms.effort
 
 
-def step_terms(
+def track(
     params: PIDParams,
     state: PIDState,
     setpoint: Array,
     measurement: Array,
+    effort: Array,
     dt: Array,
     **inputs: Array,
-) -> tuple[PIDState, Terms]:
-    """Advance the law as :func:`step`, with the same arguments; return the state and all terms,
-    effort included.
+) -> PIDState:
+    """Return the state whose next step, on these same inputs, gives ``effort`` (envs, joints): its
+    integral makes up the difference.
+
+    Call it at every step under manual control, or once after a change of kp or kd, with the last
+    effort. ``inputs`` are the optional ones of :func:`step`. The limits hold, those of the integral
+    too.
+
+    Raises InvalidArgumentError as :func:`step`, and if the params have no integral (ki is None).
     """
-    state, terms = _step(
-        params,
-        state,
-        setpoint,
-        measurement,
-        dt,
-        **inputs,
-    )
-    return state, terms.filled()
+    if instance("params", params, PIDParams, "build them with make_params").ki is None:
+        remedy = "give ki; 0 is allowed"
+        raise InvalidArgumentError("params.ki", "is off: no integral takes over", remedy=remedy)
+    _, effort = checked_inputs(params, state, measurement, effort=effort)
+    _, terms = _step(params, state, setpoint, measurement, dt, **inputs)
+    integral = state.integral + (effort - terms.unsaturated)
+    xp = namespace(*params, integral)
+    return state._replace(integral=clip(integral, params.integral_min, params.integral_max, xp))
 
 
 def _step(
@@ -159,13 +159,22 @@ def _step(
     setpoint: Array,
     measurement: Array,
     dt: Array,
-    **inputs: Array,
+    measurement_rate: Array = None,
+    setpoint_rate: Array = None,
+    feedforward: Array = None,
 ) -> tuple[PIDState, Terms]:
     """Check the arguments of a step and advance the law."""
-    y, r, *rest = checked_inputs(params, state, measurement, setpoint=setpoint, **inputs)
+    y, r, *optional = checked_inputs(
+        params,
+        state,
+        measurement,
+        setpoint=setpoint,
+        measurement_rate=measurement_rate,
+        setpoint_rate=setpoint_rate,
+        feedforward=feedforward,
+    )
     check_state(state, params)
-    optional = dict(zip(inputs, rest, strict=True))
-    return advance(discretise(params.for_rank(y.ndim), dt), state, r, y, **optional)
+    return advance(discretise(params.for_rank(y.ndim), dt), state, r, y, *optional)
 
 
 def advance(
@@ -180,8 +189,7 @@ def advance(
     """Advance the law with given coefficients, for loops with constant params; return the state and
     the terms.
 
-    It takes the arguments of :func:`step`, as arrays. A term may be an array of the caller:
-    :meth:`Terms.filled`.
+    It takes the arguments of :func:`step`, as arrays. A term may be an array of the caller.
 
     Raises InvalidArgumentError if the coefficients are of gain_units other than "effort", or need a
     measured rate that is not given. Gains per mass matrix: :mod:`batchpid.law.computed_torque`.
@@ -204,16 +212,6 @@ def advance(
         measurement_rate,
         feedforward,
     )
-    finite = None
-    if k.non_finite is not None:
-        finite = xp.isfinite(r) & xp.isfinite(y)
-        for optional in (r_rate, y_rate, ff):
-            if optional is not None:
-                finite = finite & xp.isfinite(optional)
-        r, y, r_rate, y_rate, ff = (
-            None if x is None else xp.where(finite, x, 0) for x in (r, y, r_rate, y_rate, ff)
-        )
-
     # The terms, in the order of the equations above.
     error = wrapped_error(k, r, y, xp)
     origin, moved_origin = origins(k, state, y, r_rate, xp)
@@ -261,10 +259,8 @@ def advance(
 
     # Anti-windup sees the saturated effort; without limits it costs nothing.
     if k.ki_dt is not None:
-        if effort is not u and k.conditional is not None:
+        if effort is not u and isinstance(k.anti_windup, Conditional):
             deeper = (u - effort) * error > 0
-            if not isinstance(k.conditional, Everywhere):
-                deeper = deeper & (k.conditional > 0)
             integral = xp.where(deeper, state.integral, integral)
         if effort is not u and k.tracking is not None:
             integral = flush(integral + k.tracking * (effort - u), k.tiny)
@@ -280,18 +276,6 @@ def advance(
         effort=None if state.effort is None else effort.copy(),
         origin=moved_origin,
     )
-    # A joint with a bad input keeps its state, as if the step had not been.
-    if finite is not None:
-        new = PIDState(
-            *(
-                None if n is None else xp.where(finite, n, o)
-                for n, o in zip(new, state, strict=True)
-            )
-        )
-        effort = xp.where(
-            finite, effort, state.effort if isinstance(k.non_finite, HoldEffort) else 0
-        )
-        u = xp.where(finite, u, effort)  # no limit has changed that
     return new, Terms(
         p,
         i,
@@ -299,7 +283,6 @@ def advance(
         0.0 if ff is None else ff,
         u,
         effort,
-        finite=finite,
     )
 
 
@@ -398,4 +381,4 @@ def advance_drive(
     # I / kp moves the target; a joint without kp has nothing to move it by.
     driven = k.kp > 0
     target = nearest_turn(setpoint, measurement, k.turns, xp)
-    return state, target + xp.where(driven, terms.filled().i, 0) / xp.where(driven, k.kp, 1)
+    return state, target + xp.where(driven, terms.i, 0) / xp.where(driven, k.kp, 1)

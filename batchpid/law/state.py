@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array, HoldEffort
-from batchpid.arrays.elementwise import in_dtype_of, namespace
+from batchpid.arrays.array_types import Array
+from batchpid.arrays.elementwise import in_dtype_of
 from batchpid.arrays.records import Record, array_summary
 from batchpid.checks import instance, read_array, time_step
 from batchpid.errors import InvalidArgumentError
@@ -41,11 +41,7 @@ class PIDState(Record, _PIDStateFields):
 
 
 class Terms(NamedTuple):
-    """Terms of the law in one step, each (envs, joints); 0 for a term that is off.
-
-    :func:`batchpid.advance` leaves out what :meth:`filled` computes: 0.0 is a term that is off, and
-    None a mask.
-    """
+    """Terms of the law in one step, each (envs, joints); 0.0 for a term that is off."""
 
     p: Array
     """Proportional term [N m or N]."""
@@ -58,40 +54,20 @@ class Terms(NamedTuple):
     unsaturated: Array
     """Their sum: the computed effort."""
     effort: Array
-    """The applied effort, after saturation."""
-    saturated: Array = None
-    """Bool: a limit (of the effort or its rate) changed the effort."""
-    finite: Array = None
-    """Bool: every input of this env and joint was finite."""
-
-    def filled(self) -> Terms:
-        """Return all terms as new arrays (envs, joints), but for the effort."""
-        xp = namespace(*self)
-        finite = self.finite
-        zero = xp.zeros_like(self.effort)
-        if finite is None:
-            terms = [zero + term for term in self[:5]]
-            finite = xp.isfinite(self.unsaturated)
-        else:
-            terms = [xp.where(finite, term, zero) for term in self[:5]]
-        saturated = self.effort != self.unsaturated
-        return Terms._make((*terms, self.effort, saturated, finite))
+    """The applied effort, which differs where a limit (of the effort or its rate) acts."""
 
     def __repr__(self) -> str:
         return array_summary(self, "envs", "joints")
 
 
-DRIVE_LACKS = {
-    "effort_rate_limit": None,
-    "derivative_filter_time": None,
-    "setpoint_weight": None,
-    "setpoint_weight_derivative": None,
-    "deadband": None,
-    "non_finite": "propagate",
-}
-"""Options that change P, D or the effort in a way that no target of a drive can, and their values
-for off.
-"""
+DRIVE_LACKS = (
+    "effort_rate_limit",
+    "derivative_filter_time",
+    "setpoint_weight",
+    "setpoint_weight_derivative",
+    "deadband",
+)
+"""Options that change P, D or the effort in a way that no target of a drive can."""
 
 
 def checked_inputs(
@@ -151,11 +127,11 @@ def check_drive(params: PIDParams) -> None:
     """Raise InvalidArgumentError for options of the law that a drive of stiffness kp and damping kd
     does not have.
     """
-    lacking = {name: off for name, off in DRIVE_LACKS.items() if getattr(params, name) is not None}
+    lacking = [name for name in DRIVE_LACKS if getattr(params, name) is not None]
     if lacking:
-        others = ", ".join(f"{name}={off!r}" for name, off in lacking.items())
+        others = ", ".join(f"{name}=None" for name in lacking)
         raise InvalidArgumentError(
-            f"params.{next(iter(lacking))}",
+            f"params.{lacking[0]}",
             "is not available in a drive, whose effort is kp (target - y) - kd dy/dt within the"
             " effort limits",
             remedy=f"use params.replace({others}), or the PID law, as in control 'pid'",
@@ -191,7 +167,7 @@ def needs(params: PIDParams) -> PIDState:
         derivative=differentiates and params.derivative_filter_time is not None,
         setpoint=weights_rate,
         setpoint_seen=weights_rate,
-        effort=params.effort_rate_limit is not None or isinstance(params.non_finite, HoldEffort),
+        effort=params.effort_rate_limit is not None,
         origin=weights,
     )
 

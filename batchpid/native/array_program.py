@@ -43,20 +43,15 @@ def interpreter() -> ModuleType:
     return native
 
 
-def threads_for(numbers: int, threads: int | None = None) -> int:
-    """Return the number of threads for arrays of ``numbers`` numbers: at most ``threads``, or the
-    cores available.
-    """
+def threads_for(numbers: int) -> int:
+    """Return the number of threads for arrays of ``numbers`` numbers: at most the cores available."""
     most = numbers // NUMBERS_PER_THREAD
     if most < 2:
         return 1
     # The process may be bound to fewer cores than the machine has.
-    if threads is None:
-        if hasattr(os, "sched_getaffinity"):
-            threads = len(os.sched_getaffinity(0))
-        else:
-            threads = os.cpu_count() or 1
-    return min(most, threads)
+    if hasattr(os, "sched_getaffinity"):
+        return min(most, len(os.sched_getaffinity(0)))
+    return min(most, os.cpu_count() or 1)
 
 
 class ArrayProgram:
@@ -64,8 +59,7 @@ class ArrayProgram:
     of one dtype.
 
     A constant is an array (rows, columns) or (1, columns), or a number. ``inputs`` is the number of
-    other inputs, ``threads`` the largest number of threads (None: the cores that this process may
-    use).
+    other inputs. The result does not depend on the number of threads.
     """
 
     def __init__(
@@ -75,7 +69,6 @@ class ArrayProgram:
         inputs: int,
         shape: tuple[int, int],
         dtype: DType = np.float64,
-        threads: int | None = None,
     ) -> None:
         self.shape = shape
         self.dtype = np.dtype(dtype)
@@ -99,7 +92,7 @@ class ArrayProgram:
         """Arguments of ``make_program`` in make_program.h."""
         self._program = interpreter().program(*self.arguments)
         self._run = interpreter().run
-        self._threads = threads_for(shape[0] * shape[1], threads)
+        self._threads = threads_for(shape[0] * shape[1])
 
     def __call__(self, *arrays: Rows, out: Sequence[Rows] | None = None) -> Sequence[Rows]:
         """Return the results for the other inputs, in new arrays or in ``out``.
@@ -181,7 +174,6 @@ class TreeProgram:
         inputs: Pytree,
         shape: tuple[int, int],
         dtype: DType = np.float64,
-        threads: int | None = None,
     ) -> None:
         histories = tuple([array.ndim == 3 for array in leaves(state)])
         trees = map(structure, (constants, state, inputs))
@@ -194,7 +186,6 @@ class TreeProgram:
             count,
             shape,
             dtype,
-            threads,
         )
 
     def bind(self, state: Pytree, inputs: Pytree, last: Rows | None = None) -> Bound:

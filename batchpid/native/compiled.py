@@ -21,7 +21,7 @@ from batchpid.arrays.trees import leaves, structure
 from batchpid.law.coefficients import Coefficients, discretise
 from batchpid.law.params import make_params
 from batchpid.law.pid import advance, init
-from batchpid.law.state import PIDState, Terms
+from batchpid.law.state import PIDState
 from batchpid.native.array_program import TreeProgram
 from batchpid.native.tracing import Segment, trace_change
 
@@ -29,22 +29,14 @@ _MEASUREMENT = 1
 """Index of the measurement among the inputs: the only input that must be (envs, joints)."""
 
 
-def law_with_terms(
+def law(
     k: Coefficients, state: PIDState, inputs: tuple[Any, ...]
-) -> tuple[PIDState, Any, tuple[()]]:
-    """Return the state, and terms and effort of a step, as for :class:`.TreeProgram`."""
+) -> tuple[PIDState, Array, tuple[()]]:
+    """Return the state and the effort of a step, as for :class:`.TreeProgram`."""
     new, terms = advance(k, state, *inputs)
     # A state may have arrays that these coefficients do not need.
     new = PIDState(*[old if leaf is None else leaf for old, leaf in zip(state, new, strict=True)])
-    return new, (terms.filled(), terms.effort), ()
-
-
-def law_with_effort(
-    k: Coefficients, state: PIDState, inputs: tuple[Any, ...]
-) -> tuple[PIDState, Any, tuple[()]]:
-    """Return the state and the effort of a step."""
-    new, (_, effort), _ = law_with_terms(k, state, inputs)
-    return new, effort, ()
+    return new, terms.effort, ()
 
 
 class CompiledLaw:
@@ -52,25 +44,16 @@ class CompiledLaw:
     dtype.
     """
 
-    def __init__(
-        self,
-        k: Coefficients,
-        num_envs: int,
-        terms: bool,
-        threads: int | None,
-    ) -> None:
+    def __init__(self, k: Coefficients, num_envs: int) -> None:
         self._k = k
-        self._law = law_with_terms if terms else law_with_effort
-        self._terms = terms
-        self._threads = threads
         self._shape = num_envs, k.kp.shape[1]
         self._programs: dict[tuple[bool, ...], TreeProgram] = {}
 
     def step(
         self, state: PIDState, inputs: tuple[Rows | None, ...], out: Rows | None
-    ) -> tuple[PIDState, Array, Terms | None, Callable[..., Rows] | None]:
-        """Advance the law; return the new state, the effort, the terms, and a fast function for the
-        next steps.
+    ) -> tuple[PIDState, Array, Callable[..., Rows]]:
+        """Advance the law; return the new state, the effort, and a fast function for the next
+        steps.
 
         The new state is written into the arrays of ``state``. The fast function advances this state
         in place, for ``out`` and the same kinds of inputs: see :meth:`ArrayProgram.bind`.
@@ -87,26 +70,20 @@ class CompiledLaw:
         key = tuple([leaf is None for leaf in (*state, *inputs)])
         if key not in self._programs:
             self._programs[key] = TreeProgram(
-                self._law,
+                law,
                 self._k,
                 state,
                 inputs,
                 self._shape,
                 self._k.kp.dtype,
-                self._threads,
             )
         tree = self._programs[key]
         bound = tree.bind(state, inputs, out)
         tree.program(*bound.inputs, out=bound.outputs)
-        result = bound.after[1]
-        # The fast function writes into the same arrays at every step; terms need new ones.
-        if self._terms:
-            terms, effort = result
-            return state, effort, terms._replace(effort=effort), None
         inputs_mask = sum((entry is not None) << at for at, entry in enumerate(inputs))
         written = bound.outputs[:-1]
         fast = tree.program.bind(leaves(state), written, inputs_mask, 1 << _MEASUREMENT)
-        return state, result, None, fast
+        return state, bound.after[1], fast
 
     def _whole(self, leaf: Rows) -> Rows:
         """Return a leaf of the state as a contiguous array (envs, joints); a row that all envs
@@ -155,7 +132,7 @@ def law_segments() -> Iterator[Segment]:
         state = init(params, NUMBERS)
         trees = map(structure, (discretise(params, 1.0), state, inputs))
         histories = (False,) * len(leaves(state))
-        yield from trace_change(law_with_effort, histories, *trees).program.segments
+        yield from trace_change(law, histories, *trees).program.segments
 
 
 def header(segments: Iterable[Segment], dtypes: tuple[str, ...]) -> str:

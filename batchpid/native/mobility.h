@@ -117,7 +117,7 @@ inline void bound_inverses(Lanes const *matrix, Lanes s0, Lanes unsure, Lanes *o
 }
 
 // Write the inverses of mobilities over the selected axes with both bounds, with 0 for the other axes; `near` gets 1.0 in
-// the lanes where they are bounded. `springs` may be the mobility.
+// the lanes where they are bounded.
 inline void selected_inverses(Lanes const *mobility, Lanes const *axes, Lanes s0, Lanes *out, Lanes *springs,
                               Lanes &near) {
   constexpr int SIZE = AXES * AXES;

@@ -39,14 +39,12 @@ class Given {
 };
 
 // Return the share of an effort, added to efforts `at`, with which the joints within their limits stay there.
-inline Lanes share_within(std::int64_t dof, Lanes const *effort, Lanes const *at, Lanes const *base, Lanes const *low,
-                          Lanes const *high) {
-  Lanes const infinite = std::numeric_limits<double>::infinity();
+inline Lanes share_within(std::int64_t dof, Lanes const *effort, Lanes const *at, Lanes const *base,
+                          Lanes const *limit) {
   Lanes share = 1.0;
-  for (std::int64_t i = 0; i < dof; ++i) {
-    Lanes const least = low == nullptr ? -infinite : low[i], most = high == nullptr ? infinite : high[i];
-    Lanes const able = at_least_mask(base[i], least) * at_least_mask(most, base[i]);
-    Lanes const room = at_least(where_positive(effort[i], most - at[i], at[i] - least), 0.0);
+  for (std::int64_t i = 0; i < dof && limit != nullptr; ++i) {
+    Lanes const able = at_least_mask(limit[i], absolute(base[i]));
+    Lanes const room = at_least(where_positive(effort[i], limit[i] - at[i], at[i] + limit[i]), 0.0);
     Lanes const size = absolute(effort[i]);
     Lanes const limited = where_positive(size - room, able, Lanes{});
     if (!any_positive(limited)) continue;
@@ -58,8 +56,8 @@ inline Lanes share_within(std::int64_t dof, Lanes const *effort, Lanes const *at
 // A law on arrays of some robots; `dynamics`, where it is given, has the arrays of the task that are left out.
 class OSCLaw {
  public:
-  OSCLaw(std::int64_t dof, bool in_tool_axes, Tables const &table, ToolDynamics *dynamics = nullptr)
-      : dof_(dof), in_tool_axes_(in_tool_axes), table_(table), given_(table) {
+  OSCLaw(std::int64_t dof, Tables const &table, ToolDynamics *dynamics = nullptr)
+      : dof_(dof), table_(table), given_(table) {
     for (std::int64_t i = 0; i < dof; ++i) (table[LAW_CHAIN].data[i] > 0 ? chain_ : others_).push_back(i);
     auto const n = static_cast<std::size_t>(dof), links = chain_.size();
     factor_.resize(links * links);
@@ -145,7 +143,6 @@ class OSCLaw {
 
   // Set error, a, a_n and a_s.
   void set_accelerations() {
-    Lanes *jacobian = given_[LAW_JACOBIAN], *rate = given_[LAW_JACOBIAN_RATE];
     Lanes const *qpos = given_[LAW_QPOS], *qvel = given_[LAW_QVEL];
     Lanes const *target = given_[LAW_TWIST], *target_rate = given_[LAW_ACCELERATION];
     Lanes twist[AXES];
@@ -157,14 +154,6 @@ class OSCLaw {
       for (int k = 0; k < 3; ++k) near_error_[half + k] = scale * e[k];
     }
     add_moved(qvel, twist);
-    if (in_tool_axes_) {
-      Turn const turn(given_[LAW_POSE] + 3);
-      if (target != nullptr) target = std::copy(target, target + AXES, turned_[0]) - AXES;
-      if (target_rate != nullptr) target_rate = std::copy(target_rate, target_rate + AXES, turned_[1]) - AXES;
-      for (Lanes *vector : {error_, near_error_, twist, rate, turned_[0], turned_[1]}) turn.reverse(vector, 1);
-      for (std::int64_t const j : chain_) turn.reverse(jacobian + j, dof_);
-    }
-    target_ = target;
     for (int axis = 0; axis < AXES; ++axis) {
       a_[axis] = given_[LAW_KP][axis] * near_error_[axis] - given_[LAW_KD][axis] * twist[axis];
       if (target != nullptr) a_[axis] += given_[LAW_C][axis] * target[axis];
@@ -189,9 +178,9 @@ class OSCLaw {
     }
   }
 
-  // Set the factor of M_cc, L, L_n and L_s.
+  // Set the factor of M_cc, L and L_s.
   void set_inertias() {
-    Lanes const *jacobian = given_[LAW_JACOBIAN], *mass = given_[LAW_MASS_MATRIX], *axes = given_[LAW_AXES];
+    Lanes const *jacobian = given_[LAW_JACOBIAN], *mass = given_[LAW_MASS_MATRIX];
     std::int64_t const size = links();
     for (std::int64_t i = 0; i < size; ++i) {
       for (std::int64_t j = 0; j <= i; ++j) factor_[i * size + j] = mass[chain_[i] * dof_ + chain_[j]];
@@ -199,7 +188,7 @@ class OSCLaw {
     }
     factorize(size, factor_.data());
     solve_lower<AXES>(size, factor_.data(), white_.data());  // L^-1 J^T, with M_cc = L D L^T
-    Lanes mobility[AXES * AXES], allowed[AXES];
+    Lanes mobility[AXES * AXES];
     for (std::int64_t i = 0; i < size; ++i) {
       Lanes const *row = &white_[i * AXES], inverse = factor_[i * size + i];
       for (int a = 0; a < AXES; ++a) {
@@ -210,17 +199,8 @@ class OSCLaw {
     for (int a = 0; a < AXES; ++a) {
       for (int b = 0; b < a; ++b) mobility[b * AXES + a] = mobility[a * AXES + b];
     }
-    bool const force_too = axes != nullptr && given_[LAW_FORCE_AXES] != nullptr;
-    for (int axis = 0; axis < AXES && axes != nullptr; ++axis) {
-      allowed[axis] = force_too ? at_least(axes[axis], given_[LAW_FORCE_AXES][axis]) : axes[axis];
-    }
-    Lanes const s0 = *given_[LAW_SMALLEST_EIGENVALUE];
     near_ = {};
-    selected_inverses(mobility, axes == nullptr ? nullptr : allowed, s0, null_inertia_, spring_inertia_, near_);
-    inertia_ = null_inertia_;
-    if (!force_too) return;
-    selected_inverses(mobility, axes, s0, task_inertia_, mobility, near_);
-    inertia_ = task_inertia_;
+    selected_inverses(mobility, given_[LAW_AXES], *given_[LAW_SMALLEST_EIGENVALUE], inertia_, spring_inertia_, near_);
   }
 
   // Set the efforts of base, task and posture.
@@ -237,7 +217,7 @@ class OSCLaw {
     for (int axis = 0; axis < AXES; ++axis) {
       force_[axis] = along(inertia_ + axis * AXES, moved, AXES);
       if (given_[LAW_WRENCH] != nullptr) force_[axis] += given_[LAW_WRENCH][axis];
-      drop[axis] = along(spring_inertia_ + axis * AXES, sprung, AXES) - along(null_inertia_ + axis * AXES, pulled, AXES);
+      drop[axis] = along(spring_inertia_ + axis * AXES, sprung, AXES) - along(inertia_ + axis * AXES, pulled, AXES);
     }
     for (std::int64_t const i : chain_) {
       task_[i] = along(jacobian + i, force_, AXES, dof_);
@@ -255,10 +235,10 @@ class OSCLaw {
 
   // Write the results: efforts within their limits, and the integral.
   void saturate(std::int64_t first) {
-    Lanes const *low = given_[LAW_EFFORT_MIN], *high = given_[LAW_EFFORT_MAX], *integral = given_[LAW_INTEGRAL];
-    Lanes const s1 = share_within(dof_, task_.data(), base_.data(), base_.data(), low, high);
+    Lanes const *limit = given_[LAW_EFFORT_LIMIT], *integral = given_[LAW_INTEGRAL], *target = given_[LAW_TWIST];
+    Lanes const s1 = share_within(dof_, task_.data(), base_.data(), base_.data(), limit);
     for (std::int64_t i = 0; i < dof_; ++i) effort_[i] = base_[i] + s1 * task_[i];
-    Lanes const s2 = share_within(dof_, posture_.data(), effort_.data(), base_.data(), low, high);
+    Lanes const s2 = share_within(dof_, posture_.data(), effort_.data(), base_.data(), limit);
     for (std::int64_t i = 0; i < dof_; ++i) {
       whole_[i] = base_[i] + task_[i] + posture_[i];
       effort_[i] += s2 * posture_[i];
@@ -274,8 +254,7 @@ class OSCLaw {
     }
     Lanes held = near_;
     for (std::int64_t i = 0; i < dof_; ++i) {
-      if (low != nullptr) effort_[i] = at_least(effort_[i], low[i]);
-      if (high != nullptr) effort_[i] = at_most(effort_[i], high[i]);
+      if (limit != nullptr) effort_[i] = at_most(at_least(effort_[i], -limit[i]), limit[i]);
       limited_[i] = differs_mask(effort_[i], whole_[i]);
       held = where_positive(limited_[i], 1.0, held);
     }
@@ -284,10 +263,10 @@ class OSCLaw {
       Lanes next[AXES];
       for (int axis = 0; axis < AXES; ++axis) {
         next[axis] = integral[axis] + given_[LAW_KI_DT][axis] * near_error_[axis];
-        if (given_[LAW_KI_DT2] != nullptr && target_ != nullptr) next[axis] -= given_[LAW_KI_DT2][axis] * target_[axis];
-        Lanes const limit = given_[LAW_INTEGRAL_LIMIT][axis];
+        if (target != nullptr) next[axis] -= given_[LAW_KI_DT2][axis] * target[axis];
+        Lanes const most = given_[LAW_INTEGRAL_LIMIT][axis];
         Lanes const grows = held * where_positive(a_[axis] * near_error_[axis], 1.0, 0.0);
-        next[axis] = where_positive(grows, integral[axis], at_most(at_least(next[axis], -limit), limit));
+        next[axis] = where_positive(grows, integral[axis], at_most(at_least(next[axis], -most), most));
       }
       table_[LAW_NEXT_INTEGRAL].store(first, next);
     }
@@ -303,16 +282,14 @@ class OSCLaw {
   }
 
   std::int64_t dof_;
-  bool in_tool_axes_;
   Tables const &table_;
   Given given_;
   std::vector<std::int64_t> chain_, others_;
   std::vector<Lanes> factor_, white_, moved_;
   std::vector<Lanes> a_n_, a_s_, base_, task_, posture_;  // 0 for joints without a part in an effort
   std::vector<Lanes> effort_, whole_, limited_, friction_;
-  Lanes error_[AXES], near_error_[AXES], turned_[2][AXES], a_[AXES], force_[AXES], near_;
-  Lanes const *target_ = nullptr;  // twist of the setpoint in the law's axes
-  Lanes task_inertia_[AXES * AXES], null_inertia_[AXES * AXES], spring_inertia_[AXES * AXES], *inertia_ = null_inertia_;
+  Lanes error_[AXES], near_error_[AXES], a_[AXES], force_[AXES], near_;
+  Lanes inertia_[AXES * AXES], spring_inertia_[AXES * AXES];
 };
 
 }  // namespace batchpid

@@ -76,7 +76,7 @@ std::int64_t law_columns(int array, std::int64_t dof) {
                          LAW_TASK_SHARE, LAW_POSTURE_SHARE, LAW_NEAR_SINGULAR};
   constexpr int SIX[] = {LAW_JACOBIAN_RATE, LAW_TWIST, LAW_ACCELERATION, LAW_WRENCH, LAW_INTEGRAL, LAW_KP, LAW_KD, LAW_C,
                          LAW_ACCELERATION_SHARE, LAW_KI_DT, LAW_KI_DT2,
-                         LAW_INTEGRAL_LIMIT, LAW_AXES, LAW_FORCE_AXES, LAW_NEXT_INTEGRAL, LAW_ERROR, LAW_FORCE};
+                         LAW_INTEGRAL_LIMIT, LAW_AXES, LAW_NEXT_INTEGRAL, LAW_ERROR, LAW_FORCE};
   if (array == LAW_POSE || array == LAW_SETPOINT) return POSE;
   if (array == LAW_JACOBIAN) return AXES * dof;
   if (array == LAW_MASS_MATRIX) return dof * dof;
@@ -89,20 +89,19 @@ std::int64_t law_columns(int array, std::int64_t dof) {
 struct Step : Call {
   static constexpr char CAPSULE[] = "batchpid.Step";
 
-  // Arguments: rows, dof, in_tool_axes, tree, body and tool (None, any and None without them), *arrays of Law.
+  // Arguments: rows, dof, tree, body and tool (None, any and None without them), *arrays of Law.
   bool open(PyObject *const *arguments) {
     rows = PyLong_AsLong(arguments[0]);
-    std::int64_t const dof = PyLong_AsLong(arguments[1]), body = PyLong_AsLong(arguments[4]);
-    bool const in_tool_axes = PyLong_AsLong(arguments[2]) != 0;
-    if (!PyErr_Occurred() && arguments[3] != Py_None) {
-      if (Tree const *given = held<Tree>(arguments[3])) tree = *given;
+    std::int64_t const dof = PyLong_AsLong(arguments[1]), body = PyLong_AsLong(arguments[3]);
+    if (!PyErr_Occurred() && arguments[2] != Py_None) {
+      if (Tree const *given = held<Tree>(arguments[2])) tree = *given;
     }
-    if (PyErr_Occurred() || !tool.open(arguments[5], FRAME, rows, false)) return false;
+    if (PyErr_Occurred() || !tool.open(arguments[4], FRAME, rows, false)) return false;
     for (int i = 0; i < LAW; ++i) {
-      if (!table.open(arguments[6 + i], law_columns(i, dof), i == LAW_CHAIN ? 1 : rows, i >= LAW_EFFORT)) return false;
+      if (!table.open(arguments[5 + i], law_columns(i, dof), i == LAW_CHAIN ? 1 : rows, i >= LAW_EFFORT)) return false;
     }
     if (tool[0]) dynamics = std::make_unique<ToolDynamics>(tree, body);
-    law = std::make_unique<OSCLaw>(dof, in_tool_axes, table, dynamics.get());
+    law = std::make_unique<OSCLaw>(dof, table, dynamics.get());
     return true;
   }
 

@@ -73,27 +73,6 @@ struct Tool {
   }
 };
 
-// Rotation matrix of a quaternion (w, x, y, z): matrix_of in frames.py.
-struct Turn {
-  Lanes rows[3][3];
-
-  explicit Turn(Lanes const *q) {
-    Lanes const w = q[0], x = q[1], y = q[2], z = q[3];
-    Lanes const s = 2.0 / (w * w + x * x + y * y + z * z);
-    Lanes const found[3][3] = {{1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)},
-                               {s * (x * y + w * z), 1.0 - s * (x * x + z * z), s * (y * z - w * x)},
-                               {s * (x * z - w * y), s * (y * z + w * x), 1.0 - s * (x * x + y * y)}};
-    for (int i = 0; i < 3; ++i) std::copy(found[i], found[i] + 3, rows[i]);
-  }
-  // Give both halves of a twist or wrench (6,) in the axes of this rotation.
-  void reverse(Lanes *twist, std::int64_t stride) const {
-    for (Lanes *half : {twist, twist + 3 * stride}) {
-      Lanes const x = half[0], y = half[stride], z = half[2 * stride];
-      for (int k = 0; k < 3; ++k) half[k * stride] = rows[0][k] * x + rows[1][k] * y + rows[2][k] * z;
-    }
-  }
-};
-
 inline Lanes length_of(Lanes const *v) { return root(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]); }
 
 // Write the error (6,) from a pose to a goal: pose_error in frames.py.

@@ -39,7 +39,6 @@ BLENDS = {
     "align": "fade",
     "newest": "",
     "ensemble": "weight",
-    "average": "share",
 }
 """Blends, with the option that each of them has."""
 
@@ -65,16 +64,6 @@ class _PlanFields(NamedTuple):
     ] = None
     forgotten: Array = None
     """1 - exp(-m) of an ensemble."""
-    share: Annotated[
-        Array,
-        Field(
-            "1",
-            above=True,
-            high=0.999,
-            default=0.7,
-        ),
-    ] = None
-    taper: Annotated[Array, Field("s")] = None
     rate: Annotated[Array, GUARD_FIELDS["rate"]] = None
     """V [rad/s or m/s]."""
     acceleration: Annotated[Array, GUARD_FIELDS["acceleration"]] = None
@@ -149,16 +138,10 @@ def make_plan(
         - "newest": the chunk replaces the plan.
         - "ensemble": the mean of all chunks for the same time, with weights exp(-m i), where i is 0
           for the oldest one.
-        - "average": share of the new chunk plus (1 - share) of the present plan.
     fade
         Of "align": time over which the offset fades [s]; default 1.
     weight
         Of "ensemble": m; default 0.01.
-    share
-        Of "average": share of the new chunk; default 0.7.
-    taper
-        Of "ensemble" and "average": time before its end over which a chunk loses its weight [s];
-        default 0.
     interpolation
         "cubic", with rates that are central differences of the blended rows; "linear", or "hold".
     latest
@@ -177,21 +160,17 @@ def make_plan(
         Naming the option, joint, env and value; also for an option of another blend.
     """
     build = LeafBuilder(joints, joint_names, dtype, options.values())
-    option = BLENDS[choice("blend", blend, BLENDS)]
-    # A blend has its option, and the last two share one.
-    others = {name for name in BLENDS.values() if name != option}
-    if option not in ("weight", "share"):
-        others.add("taper")
-    for name in others:
-        if options.get(name) is not None:
-            remedy = "leave it out, or choose another blend"
-            raise InvalidArgumentError(name, f"has no effect with blend {blend!r}", remedy=remedy)
-    if option and options.get(option) is None:
-        options[option] = PLAN_FIELDS[option].default
     leaves = build.options(PLAN_FIELDS, options)
-    # An ensemble stays one where m is 0.
+    # A blend has its own option alone.
+    option = BLENDS[choice("blend", blend, BLENDS)]
+    for name in sorted(options.keys() & set(BLENDS.values()) - {option}):
+        remedy = "leave it out, or choose another blend"
+        raise InvalidArgumentError(name, f"has no effect with blend {blend!r}", remedy=remedy)
+    if option:
+        field = PLAN_FIELDS[option]
+        # An ensemble stays one where m is 0.
+        leaves[option] = build.array(option, options.get(option, field.default), field)
     if option == "weight":
-        leaves["weight"] = build.array("weight", options["weight"], PLAN_FIELDS["weight"])
         leaves["forgotten"] = 1.0 - np.exp(-leaves["weight"])
     horizon = integer("horizon", horizon, 1, LONGEST_HORIZON)
     newest = [integer("latest", joint, 0, build.joints - 1) for joint in latest]

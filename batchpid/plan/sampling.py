@@ -8,14 +8,12 @@ x(t) and the time t of the last sample, the blended rows are, by :func:`batchpid
     align       b_k = c_k + o max(1 - s, 0) + (o + o' fade) u (1 - u)^2 / 5
                 s   = (T_k - T_f) / fade,   u = min(5 s, 1)
     ensemble    b_k = x(T_k) + g_k / (W_k + g_k) (c_k - x(T_k)),   g_k = 1 - W_k (1 - exp(-m))
-    average     the same with g_k = W_k share / (1 - share), or 1 where W_k is 0
 
 o = x(T_f) - c_f is the offset, which fades, and o' = x'(T_f) - c'_f its rate, from which the rate
 of the fading is reached in a fifth of that time. f is the first row that is at least P / 2 ahead of
 t; those before it have passed, and are dropped. If all have passed, the last one is taken for t +
-P. W_k is the weight of the chunks so far at that time, to which g_k is added: without taper the g
-are exp(-m i), i = 0, 1, ... With a taper g_k is multiplied by min(1, (T_n - T_k) / taper), where
-T_n is the end of the chunk.
+P. W_k is the weight of the chunks so far at that time, to which g_k is added: the g are exp(-m i),
+i = 0, 1, ...
 
 The knots of the new plan are x(t) at t, where the plan has its rate too, and b_k at T_k from f on,
 with the rates (b_{k+1} - b_{k-1}) / (2 P), one-sided at the ends of the chunk. Behind the last row
@@ -32,7 +30,7 @@ sample is this polynomial (:func:`advance`).
 
 Limits of the plan are those of :mod:`batchpid.motors.guard` on x. The alignment is after the policy
 runner of axol, the ensemble after ACT (T. Z. Zhao et al., Learning Fine-Grained Bimanual
-Manipulation with Low-Cost Hardware, RSS 2023), the average after LeRobot.
+Manipulation with Low-Cost Hardware, RSS 2023).
 """
 
 from __future__ import annotations
@@ -161,7 +159,6 @@ def add(
         slope,
         first,
         step,
-        rows,
     )
     # Central differences, one-sided at the ends of the chunk.
     rise = xp.diff(blended if rows > 1 else xp.concatenate((position, blended), -2), axis=-2)
@@ -219,13 +216,12 @@ def blend(
     slope: Array,
     first: Array,
     step: Array,
-    rows: Array,
 ) -> tuple[Array, Array]:
     """Return row number ``step`` of a chunk that begins at ``begin`` [s], blended with the plan,
     and its weight, 0 where chunks are not averaged.
 
-    ``offset`` is that of the alignment, in row ``first``, and ``slope`` its rate; ``rows`` is the
-    number of rows. Arrays have the shape of the times of ``state``, or one that broadcasts with it.
+    ``offset`` is that of the alignment, in row ``first``, and ``slope`` its rate. Arrays have the
+    shape of the times of ``state``, or one that broadcasts with it.
     """
     xp = namespace(*plan, state.knots, chunk, begin, step)
     if plan.fade is not None:
@@ -235,18 +231,13 @@ def blend(
         eased = u * (rest * rest) * (EASE * (offset + plan.fade * slope))
         faded = plan.blended * (xp.maximum(1.0 - s, 0.0) * offset + eased)
         return chunk + faded, 0.0 * chunk
-    if plan.forgotten is None and plan.share is None:
+    if plan.forgotten is None:
         return chunk, 0.0 * chunk
     time = begin + step * plan.period
     present, _ = curve(plan, state, time)
     near = xp.rint((time - state.begin) / plan.period)
     old = xp.where(near >= 0, take_rows(state.weights, _row(plan, near)), 0.0) * plan.blended
-    if plan.share is None:
-        new = 1.0 - old * plan.forgotten
-    else:
-        new = xp.where(old > 0, old * (plan.share / (1.0 - plan.share)), 1.0)
-    if plan.taper is not None:
-        new = new * xp.minimum((rows - step) * plan.period / plan.taper, 1.0)
+    new = 1.0 - old * plan.forgotten
     return present + new / (old + new) * (chunk - present), old + new
 
 

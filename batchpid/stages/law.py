@@ -12,7 +12,7 @@ import numpy as np
 from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import clip, namespace, nearest_turn
 from batchpid.law.coefficients import Coefficients, discretise, spread
-from batchpid.law.computed_torque import advance_with_mass_matrix, convert_integral
+from batchpid.law.computed_torque import advance_with_mass_matrix
 from batchpid.law.params import PIDParams
 from batchpid.law.pid import advance, advance_drive, init
 from batchpid.law.state import PIDState
@@ -88,7 +88,7 @@ class Matrix(Stage):
         return self.coupling.mass_matrix(matrix)
 
     def bind(self, program: Any, state: Array, values: Values) -> Values:
-        tree, bodies = program.pack.rigid_tree.tables
+        tree, bodies = program.pack.force_model.tables
         program.place(
             pose=values.seen.qpos,
             rate=values.seen.qvel,
@@ -167,11 +167,9 @@ class PID(Stage):
         )
 
     def adopt(self, before: Self, state: PIDState, values: Values) -> PIDState:
-        # The integral in the unit of the new gains, by the params that have them per mass matrix.
-        matrix = before.matrix or self.matrix
-        if matrix is not None and before.params.gain_units != self.params.gain_units:
-            at = matrix.at(values.measured.qpos, values)
-            state = convert_integral(state, before.params, self.params, at)
+        # The integral has the unit of the gains, so in other units the law starts again.
+        if before.params.gain_units != self.params.gain_units:
+            return init(self.params, values.measured.qpos)
         return state
 
 

@@ -9,16 +9,14 @@ from batchpid.task_space.inverse_kinematics import (
     IKResult,
     inverse_kinematics,
 )
-from batchpid.task_space.operational_space import init, osc, reset, task_dynamics
+from batchpid.task_space.operational_space import init, osc, task_dynamics
 from batchpid.task_space.osc_params import OSCParams, make_osc_params
 from batchpid.task_space.osc_state import (
-    OSCCoefficients,
     OSCInputs,
     OSCState,
     OSCTerms,
     TaskDynamics,
     Tool,
-    discretise,
 )
 from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.tree_quantities import (
@@ -34,7 +32,6 @@ from batchpid.task_space.tree_quantities import (
 
 __all__ = [
     "IKResult",
-    "OSCCoefficients",
     "OSCInputs",
     "OSCParams",
     "OSCState",
@@ -43,7 +40,6 @@ __all__ = [
     "TaskDynamics",
     "Tool",
     "bias",
-    "discretise",
     "forward_dynamics",
     "gravity",
     "init",
@@ -55,6 +51,5 @@ __all__ = [
     "make_osc_params",
     "mass_matrix",
     "osc",
-    "reset",
     "task_dynamics",
 ]

@@ -71,14 +71,6 @@ def multiply(a: Array, b: Array) -> Array:
     return (a[..., None] * b[..., None, :, :]).sum(-2)
 
 
-def in_axes(turn: Array, twists: Array) -> Array:
-    """Return the columns of ``twists`` (..., 6, n) in the axes of matrices (..., 3, 3)."""
-    xp = namespace(turn, twists)
-    back = xp.swapaxes(turn, -1, -2)
-    halves = [multiply(back, twists[..., :3, :]), multiply(back, twists[..., 3:, :])]
-    return xp.concatenate(halves, axis=-2)
-
-
 def turned(frame: Array, inner: Array) -> Array:
     """Return the frames ``inner`` (..., 3, 4), which are given in ``frame`` (..., 3, 4), in the
     axes in which ``frame`` is given.

@@ -23,8 +23,8 @@ from batchpid.arrays.array_types import Array, Document, Float64
 from batchpid.arrays.elementwise import namespace
 from batchpid.native.array_program import SWITCH, obstacle
 from batchpid.native.extensions import KINEMATICS, LAW, TASK_SPACE, load
+from batchpid.task_space.osc_params import OSCParams
 from batchpid.task_space.osc_state import (
-    OSCCoefficients,
     OSCInputs,
     OSCState,
     OSCTerms,
@@ -145,7 +145,7 @@ def search(
 
 
 def law(
-    k: OSCCoefficients,
+    k: OSCParams,
     state: OSCState,
     dynamics: TaskDynamics | Tool,
     inputs: OSCInputs,
@@ -179,7 +179,6 @@ def law(
         native.law,
         rows,
         dof,
-        k.frame is not None,
         *tree_arguments,
         *map(arrays.get, LAW),
     )
@@ -220,7 +219,7 @@ class BoundOSC:
 
     def __init__(
         self,
-        k: OSCCoefficients,
+        k: OSCParams,
         tool: Tool,
         parts: Mapping[str, slice],
         columns: NDArray[np.intp],
@@ -268,7 +267,6 @@ class BoundOSC:
         self._kept, self.address = native.bind(
             rows,
             dof,
-            k.frame is not None,
             *tree_arguments,
             *map(arrays.get, LAW),
         )

@@ -1,107 +1,100 @@
-"""Parameters of operational-space control: build, broadcast, validate."""
+r"""Parameters of operational-space control at a time step: build, broadcast, validate.
+
+The law's coefficients are marked with an asterisk in the acceleration of the task
+(:mod:`batchpid.task_space.operational_space`), where e is the error of the pose, v the twist of the
+tool, V and V' the twist and acceleration of the setpoint, and I the integral::
+
+    a = kp* e - kd* v + c* V + g* V' + I        I <- I + ki* dt e - ki2* V
+
+- "explicit": kp* = kp, kd* = c* = kd, g* = 1, ki* = ki and ki2* = 0. Decoupled axes are stable for
+  w dt < 0.828 with kp = w^2, kd = 2 w.
+- "implicit": the error, the twist and the integral are those at the end of the step, where V and V'
+  are given. As for joints (:mod:`batchpid.law.coefficients`), with D = 1 + dt kd + dt^2 kp + dt^3 ki::
+
+      kp* = (kp + dt ki) / D      kd* = (kd + dt kp + dt^2 ki) / D      c* = kd / D      g* = 1 / D      ki* = ki / D
+
+  and ki2* = ki* dt^2. A pole s becomes 1 / (1 - s dt): decoupled axes are stable at any dt.
+
+The posture has the same law, without V and integral.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Annotated, Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from batchpid.arrays.array_types import CHOICES, Array, Document, NamedChoice
-from batchpid.arrays.elementwise import TURN
-from batchpid.arrays.field_tables import Field, declared
-from batchpid.arrays.records import (
-    LeafBuilder,
-    Record,
-    array_summary,
-    checked_ends,
-    frozen,
-    with_fields,
-)
-from batchpid.checks import AxisKind, choice, entries, instance, read_array
+from batchpid.arrays.array_types import CHOICES, Array
+from batchpid.arrays.elementwise import TURN, exported
+from batchpid.arrays.field_tables import Field
+from batchpid.arrays.records import LeafBuilder, array_summary, with_fields
+from batchpid.checks import AxisKind, choice, instance, read_array, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space.rigid_tree import MAKE_TREE, RigidTree
 from batchpid.task_space.tree_kinematics import check_masses
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 """Names of the axes of a task."""
-MAKE_PARAMS = "build them with make_osc_params"
-"""Remedy for params of another type."""
-
-
-class ToolFrame(NamedChoice):
-    """Gains, selected axes and wrenches are in the axes of the tool."""
-
-
-TASK_CHOICES: dict[str, Document] = {
-    "frame": {"world": None, "tool": ToolFrame()},
-    "discretization": CHOICES["discretization"],
+LIMIT_STIFFNESS = 400.0
+"""Of the springs that push joints away from their limits [1/s^2]."""
+OSC_FIELDS = {
+    "stiffness": Field("1/s^2", group="axis", default=150.0),
+    "damping_ratio": Field("1", 1.0, group="axis", default=1.0),
+    "posture_stiffness": Field("1/s^2", group="joint", default=10.0),
+    "limit_margin": Field("rad or m", group="joint", default=0.0),
+    "position_error_limit": Field("m", math.inf, above=True, group="norm", default=0.1),
+    "rotation_error_limit": Field("rad", math.inf, above=True, group="norm", default=0.5),
+    "smallest_eigenvalue": Field("1/kg or 1/(kg m^2)", above=True, group="s0", default=0.02),
+    "effort_limit": Field("N m or N", math.inf, group="joint"),
+    "integral_gain": Field("1/s^3", group="axis", default=0.0),
+    "integral_limit": Field("m/s^2 or rad/s^2", math.inf, group="axis", default=math.inf),
 }
-"""Options chosen by name, and the entries of the params; the first is the default."""
+"""Options with a value for each axis or joint, or one for each env."""
 
 
-class _OSCParamsFields(NamedTuple):
-    stiffness: Annotated[Array, Field("1/s^2", group="axis", default=150.0)]
-    """kp (1 | envs, 6) [1/s^2]."""
-    damping: Annotated[Array, Field("1/s", group="axis")]
-    """kd (1 | envs, 6) [1/s]."""
-    posture_stiffness: Annotated[Array, Field("1/s^2", group="joint", default=10.0)]
+@exported
+class OSCParams(NamedTuple):
+    """Parameters of operational-space control at a time step, for one tool of one kind of robot.
+    Build them with :func:`make_osc_params`.
+
+    Every leaf is a float64 array of one row or one per env; None is off.
+    """
+
+    kp: Array
+    """kp* (1 | envs, 6) [1/s^2]."""
+    kd: Array
+    """kd* (1 | envs, 6) [1/s]."""
+    c: Array
+    """c* (1 | envs, 6) [1/s]."""
+    acceleration_share: Array
+    """g* (1 | envs, 6)."""
+    posture_kp: Array
     """(1 | envs, dof) [1/s^2]."""
-    posture_damping: Array
+    posture_kd: Array
     """(1 | envs, dof) [1/s]."""
-    position_error_limit: Annotated[
-        Array,
-        Field(
-            "m",
-            math.inf,
-            above=True,
-            group="norm",
-            default=0.1,
-        ),
-    ]
+    position_error_limit: Array
     """(1 | envs, 1) [m]."""
-    rotation_error_limit: Annotated[
-        Array,
-        Field(
-            "rad",
-            math.inf,
-            above=True,
-            group="norm",
-            default=0.5,
-        ),
-    ]
+    rotation_error_limit: Array
     """(1 | envs, 1) [rad]."""
-    smallest_eigenvalue: Annotated[
-        Array,
-        Field(
-            "1/kg or 1/(kg m^2)",
-            above=True,
-            group="s0",
-            default=0.02,
-        ),
-    ]
+    smallest_eigenvalue: Array
     """s0 (1 | envs, 1) [1/kg, 1/(kg m^2)]."""
-    axes: Annotated[Array, Field(neutral=True, group="axis")] = None
-    """1.0 for the axes whose motion is controlled (1 | envs, 6); None for all."""
-    force_axes: Annotated[Array, Field(neutral=False, group="axis")] = None
-    """1.0 for further axes that the posture must not act on (1 | envs, 6)."""
-    effort_min: Annotated[Array, Field("N m or N", -math.inf, low=-math.inf, group="joint")] = None
+    axes: Array = None
+    """1.0 for the axes whose motion is controlled (1, 6); None for all."""
+    effort_limit: Array = None
     """(1 | envs, dof) [N m or N]."""
-    effort_max: Annotated[Array, Field("N m or N", math.inf, low=-math.inf, group="joint")] = None
-    frame: NamedChoice | None = None
-    """None for "world", or a choice without fields."""
-    integral_gain: Annotated[Array, Field("1/s^3", group="axis")] = None
-    """ki (1 | envs, 6) [1/s^3]."""
-    integral_limit: Annotated[
-        Array, Field("m/s^2 or rad/s^2", math.inf, group="axis", default=math.inf)
-    ] = None
+    ki_dt: Array = None
+    """ki* dt (1 | envs, 6) [1/s^2]."""
+    ki_dt2: Array = None
+    """ki2* (1 | envs, 6) [1/s]."""
+    integral_limit: Array = None
     """(1 | envs, 6) [m/s^2, rad/s^2]."""
-    limit_stiffness: Annotated[Array, Field("1/s^2", group="joint", default=400.0)] = None
-    """(1 | envs, dof) [1/s^2]."""
-    limit_margin: Annotated[Array, Field("rad or m", group="joint")] = None
-    """(1 | envs, dof) [rad or m]."""
+    limit_kp: Array = None
+    """(1 | envs, dof) [1/s^2]; 0 for joints without a margin."""
+    limit_kd: Array = None
+    """Damping over margin (1 | envs, dof)."""
     limit_low: Array = None
     """Positions (1 | envs, dof) from which joints are pushed back: limits less their margins."""
     limit_high: Array = None
@@ -109,36 +102,6 @@ class _OSCParamsFields(NamedTuple):
     """1 / (2 pi) for joints of the tree that turn without limits, whose posture is the one next to
     qpos, else 0 (1, dof); None without such joints.
     """
-    discretization: NamedChoice | None = None
-    """ImplicitLaw(): the gains act on the predicted end of the step; None: on its beginning."""
-
-
-OSC_FIELDS = declared(_OSCParamsFields, Field) | {
-    "damping_ratio": Field("1", 1.0, group="axis", default=1.0),
-    "posture_damping_ratio": Field("1", 1.0, group="joint", default=1.0),
-    "effort_limit": Field("N m or N", math.inf, group="joint"),
-}
-"""Options with a value for each axis or joint, or one for each env."""
-WITHOUT_EFFECT = {
-    "damping_ratio": ("damping", True, "damping is given, too"),
-    "integral_limit": ("integral_gain", False, "integral_gain is not given"),
-    "limit_stiffness": ("limit_margin", False, "limit_margin is not given"),
-}
-"""Options that have no effect if another option is given (True) or missing (False): that option,
-the flag, the reason.
-"""
-
-
-class OSCParams(Record, _OSCParamsFields):
-    """Parameters of operational-space control, for one tool of one kind of robot. Build it with
-    :func:`make_osc_params`.
-
-    Every leaf is a float64 array of one row or one per env; None is off.
-    """
-
-    __slots__ = ()
-    NAME = "params"
-    FIELDS = OSC_FIELDS
 
     def __repr__(self) -> str:
         return array_summary(self, "envs", "axes")
@@ -147,51 +110,44 @@ class OSCParams(Record, _OSCParamsFields):
 @with_fields(*OSC_FIELDS)
 def make_osc_params(
     tree: RigidTree,
+    dt: float,
     *,
-    frame: str = "world",
+    axes: Sequence[bool] = (True,) * len(AXES),
     discretization: str = "explicit",
     **options: ArrayLike,
 ) -> OSCParams:
-    """Build validated :class:`OSCParams` for a tool of ``tree``.
+    """Build validated :class:`OSCParams` for a tool of ``tree`` at the time step ``dt`` [s].
 
     A number may be a scalar, one per axis (6,) or joint (dof,), or one per env as well, (envs, 6)
     or (envs, dof).
 
     Parameters
     ----------
-    stiffness, damping_ratio, damping
-        kp >= 0 [1/s^2] and kd = 2 zeta sqrt(kp), or kd itself [1/s], of the axes x, y, z, rx, ry,
-        rz.
+    stiffness, damping_ratio
+        kp >= 0 [1/s^2] of the axes x, y, z, rx, ry, rz, and zeta of kd = 2 zeta sqrt(kp).
     integral_gain, integral_limit
         ki [1/s^3], which learns loads that the model does not know, and the largest size of the
         integral of each axis [m/s^2, rad/s^2]. A loop with kp and kd is stable for ki < kp kd.
-        None: no integral.
     axes
-        Bools: the axes whose motion is controlled; the posture moves the others. None: all.
-    force_axes
-        Bools: axes, not among ``axes``, that the wrench controls, and on which the posture does not
-        act.
-    posture_stiffness, posture_damping_ratio
-        Gains of the joints towards their posture: within the null space of the task for the joints
-        of the chain to the tool, fully for others, such as fingers [1/s^2]. Followers have none.
-    limit_margin, limit_stiffness
+        The axes whose motion is controlled; the posture moves the others.
+    posture_stiffness
+        Stiffness of the joints' critically damped springs to their posture: within the null space
+        of the task for the joints of the chain to the tool, fully for others, such as fingers
+        [1/s^2]. Followers have none.
+    limit_margin
         Joints of the chain that come nearer to a position limit than the margin [rad or m], or a
         quarter of their range, are pushed away within the null space, by a critically damped spring
-        [1/s^2]. None: no margin.
+        of 400/s^2. 0: no margin.
     position_error_limit, rotation_error_limit
         Largest norm of the error that enters the law [m, rad]; inf for none.
     smallest_eigenvalue
         s0 > 0 of the bounded inverse (:mod:`batchpid.task_space.operational_space`): below it,
         directions near a singularity lose stiffness; below s0/5 the posture pulls the tool there
         [1/kg, 1/(kg m^2)].
-    effort_limit, effort_min, effort_max
-        Limits of the total effort of the joints [N m or N]: ``effort_limit=x`` is ``effort_min=-x,
-        effort_max=x``.
-    frame
-        "world" or "tool": the axes of gains, selections and wrenches. Setpoints are in the world.
+    effort_limit
+        Limit of the total effort of the joints [N m or N].
     discretization
-        "explicit", or "implicit": stable at any time step
-        (:mod:`batchpid.task_space.osc_state`).
+        "explicit", or "implicit": stable at any time step.
 
     Raises
     ------
@@ -199,83 +155,54 @@ def make_osc_params(
         Naming the option, axis or joint, env and value.
     """
     check_masses(instance("tree", tree, RigidTree, MAKE_TREE))
-    joints = tree.joint_names
-    rows = _read(
-        options,
-        {
-            "axis": AXES,
-            "joint": joints,
-            "norm": ("norm",),
-            "s0": ("s0",),
-        },
-    )
-    motion = rows["axes"]
-    force = rows["force_axes"]
-    if force is not None:
-        both = force * (1.0 if motion is None else motion)
-        entries(
-            "force_axes",
-            both > 0,
-            both == 0,
-            "is an axis of motion, too",
-            AXES,
-            kind="entry",
-        )
-    if rows["damping"] is None:
-        rows["damping"] = 2 * rows["damping_ratio"] * np.sqrt(rows["stiffness"])
-    # Critical damping and the like follow from the stiffness that is left.
-    posture = rows["posture_stiffness"] * tree.coupling.independent
-    rows["posture_stiffness"] = posture
-    rows["posture_damping"] = 2 * rows["posture_damping_ratio"] * np.sqrt(posture)
-    ends = {name: rows[name] for name in ("effort_limit", "effort_min", "effort_max")}
-    rows["effort_min"], rows["effort_max"] = checked_ends(ends, joints)
-    if rows["integral_gain"] is None:
-        rows["integral_limit"] = None
-    # Joints without limits that turn are angles modulo 2 pi for the posture. Followers have no
-    # posture and no limits of their own: their leader has them.
-    lower = np.array([tree.lower])
-    upper = np.array([tree.upper])
-    if rows["limit_margin"] is None:
-        rows["limit_stiffness"] = None
-    else:
-        rows["limit_stiffness"] = rows["limit_stiffness"] * tree.coupling.independent
-        rows["limit_margin"] = margin = np.minimum(rows["limit_margin"], (upper - lower) / 4)
-        # A joint with a margin of 0 is pushed from nowhere: its ends lie at infinity.
-        rows["limit_low"] = np.where(margin > 0, lower + margin, -np.inf)
-        rows["limit_high"] = np.where(margin > 0, upper - margin, np.inf)
-    endless = np.isinf(lower) & np.isinf(upper) & (tree.bodies.slides[:, 0] == 0)
-    if endless.any():
-        rows["turns"] = endless / TURN
-    for name, chosen in {"frame": frame, "discretization": discretization}.items():
-        rows[name] = TASK_CHOICES[name][choice(name, chosen, TASK_CHOICES[name])]
-    return frozen(OSCParams(**{name: rows.get(name) for name in OSCParams._fields}))
-
-
-def _read(options: Mapping[str, ArrayLike], columns: Mapping[str, tuple[str, ...]]) -> Document:
-    """Return the rows of all options of OSC_FIELDS, with their defaults; None stays.
-
-    Raises InvalidArgumentError for an option that is given, and has no effect.
-    """
-    rows: Document = {}
+    dt = time_step("dt", dt)
+    mode = choice("discretization", discretization, CHOICES["discretization"])
+    ahead = dt if mode == "implicit" else 0.0  # of the gains: the time at which they act
+    columns = {"axis": AXES, "joint": tree.joint_names, "norm": ("norm",), "s0": ("s0",)}
+    rows: dict[str, Array] = {}
     envs = 1
     for name, field in OSC_FIELDS.items():
         names = columns[field.group]
         kind: AxisKind = "joint" if field.group == "joint" else "entry"
-        builder = LeafBuilder(len(names), names, kind=kind)
-        builder.num_envs = envs
-        value: Any = options.get(name, field.default)
-        if isinstance(field.neutral, bool) and value is not None:
-            # Bools as 1.0 and 0.0.
-            value = read_array(name, value, "b").astype(float)
-            field = Field()
-        if len(names) == 1 and np.ndim(value) == 1:  # one number for each env
-            value = np.reshape(value, (-1, 1))
-        rows[name] = builder.array(name, value, field)
-        envs = builder.num_envs
-    # An option without effect is nearly always a misunderstanding.
-    for name, (other, is_given, reason) in WITHOUT_EFFECT.items():
-        is_unused = (rows[other] is not None) == is_given
-        if is_unused and (rows[name] != OSC_FIELDS[name].default).any():
-            remedy = "leave it out, or correct the other option"
-            raise InvalidArgumentError(name, f"has no effect: {reason}", remedy=remedy)
-    return rows
+        build = LeafBuilder(len(names), names, kind=kind)
+        build.num_envs = envs
+        rows[name] = build.array(name, options.get(name, field.default), field)
+        envs = build.num_envs
+
+    def at_step(kp: Array, kd: Array) -> tuple[Array, Array, Array]:
+        # kp*, kd* and g* of a law without integral
+        share = 1 / (1 + ahead * kd + ahead * ahead * kp)
+        return kp * share, (kd + ahead * kp) * share, share
+
+    kp = rows.pop("stiffness")
+    kd = 2 * rows.pop("damping_ratio") * np.sqrt(kp)
+    ki = rows.pop("integral_gain")
+    rows["kp"], rows["kd"], share = at_step(kp + ahead * ki, kd)
+    rows["c"], rows["acceleration_share"] = kd * share, share
+    if ki.any():
+        rows["ki_dt"] = share * ki * dt
+        rows["ki_dt2"] = rows["ki_dt"] * ahead
+    elif "integral_limit" in options:
+        remedy = "leave it out, or give integral_gain"
+        raise InvalidArgumentError("integral_limit", "has no effect", remedy=remedy)
+    # Followers have no posture and no limits of their own: their leader has them.
+    leads = tree.coupling.independent
+    kp = rows.pop("posture_stiffness") * leads
+    rows["posture_kp"], rows["posture_kd"], _ = at_step(kp, 2 * np.sqrt(kp))
+    lower, upper = np.array([tree.lower]), np.array([tree.upper])
+    margin = np.minimum(rows.pop("limit_margin"), (upper - lower) / 4) * leads
+    if margin.any():
+        kp = LIMIT_STIFFNESS * (margin > 0)
+        rows["limit_kp"], damping, _ = at_step(kp, 2 * np.sqrt(kp))
+        rows["limit_kd"] = damping / np.where(margin > 0, margin, 1.0)
+        rows["limit_low"], rows["limit_high"] = lower + margin, upper - margin
+    motion = read_array("axes", axes, "b")
+    if motion.shape != (len(AXES),):
+        raise InvalidArgumentError("axes", f"has shape {motion.shape}", remedy="give six bools")
+    if not motion.all():
+        rows["axes"] = motion[None].astype(float)
+    # Joints without limits that turn are angles modulo 2 pi for the posture.
+    endless = np.isinf(lower) & np.isinf(upper) & (tree.bodies.slides[:, 0] == 0)
+    if endless.any():
+        rows["turns"] = endless / TURN
+    return OSCParams(**{name: build.freeze(leaf) for name, leaf in rows.items()})

@@ -1,6 +1,6 @@
 """Table of the commands, and the execution of one: inputs, outputs, report.
 
-No file is replaced without ``--force``, and no input at all.
+No file is replaced without ``--force``.
 """
 
 from __future__ import annotations
@@ -8,30 +8,26 @@ from __future__ import annotations
 import inspect
 import os
 import shlex
-import sys
-import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from batchpid.arrays.array_types import Document, Progress, T
+from batchpid.arrays.array_types import Document, Progress
 from batchpid.checks import file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.gains import ENDINGS, compare, export, tune
 from batchpid.sim.cli.identify import excite_joints, identify_logs
-from batchpid.sim.cli.inspect import inspect_robot, plot, view
 from batchpid.sim.cli.rollout import demo, rollout
+from batchpid.sim.cli.show import inspect_robot, plot, view
 
 PICTURES = (".png", ".svg")
 DOCUMENTS = (".yaml", ".yml", ".json")
 DEFAULT_ROBOT = "panda"
 FOLDER = Path("out")
 """Folder of default outputs, which is made when a file is written; other folders have to exist."""
-FIRST_SECONDS, LINE_SECONDS = 1.0, 10.0
-"""Time before the first line about the progress of a command, and between lines [s]."""
 FIXED: dict[str | None, bool] = {"fixed": True, "free": False}
 """Values of the flag ``--base``."""
 
@@ -130,12 +126,6 @@ def run(name: str, record: object) -> int:
 
 def _output_paths(command: CommandFunction, values: Document) -> dict[str, Path]:
     """Return the paths of the output files, checked; the outputs without a name are left out."""
-    inputs = []
-    for name, value in values.items():
-        if name not in command.outputs:
-            names = value if isinstance(value, tuple) else (value,)
-            inputs += [Path(text) for text in names if isinstance(text, str | Path)]
-    inputs = [path for path in inputs if path.is_file()]
     # Defaults are named after the robot, or stand beside the recording.
     words = values | {"robot": Path(values.get("robot") or DEFAULT_ROBOT).stem}
     words["ending"] = ENDINGS.get(values.get("to", ""), "")
@@ -148,7 +138,7 @@ def _output_paths(command: CommandFunction, values: Document) -> dict[str, Path]
             path = Path(output.default.format_map(words))
         if path is not None:
             file_path(name, path, output.suffixes)
-            check_output(name, path, inputs, values["force"])
+            check_output(name, path, values["force"])
             paths[name] = path
     return paths
 
@@ -187,22 +177,13 @@ def _write(name: str, result: Any, path: Path) -> None:
         result.film(path, progress=bar("filming", unit="frame"))
 
 
-def check_output(
-    argument: str,
-    path: Path,
-    inputs: Iterable[Path],
-    force: bool,
-) -> None:
+def check_output(argument: str, path: Path, force: bool) -> None:
     """Check that a file may be written at ``path``.
 
-    Raises InvalidArgumentError if the command reads it (one of ``inputs``), its folder neither
-    exists nor is :data:`FOLDER`, or it exists and may not be replaced by ``force``.
+    Raises InvalidArgumentError if its folder neither exists nor is :data:`FOLDER`, or it exists
+    itself and may not be replaced by ``force``.
     """
-    remedy = "choose another file"
-    # Links count as the file that they lead to, so that none is read and replaced at once.
-    if path.exists() and any(path.samefile(source) for source in inputs):
-        problem = "is a file to read"
-    elif not path.parent.exists() and path.parent != FOLDER:
+    if not path.parent.exists() and path.parent != FOLDER:
         problem = f"has no folder {str(path.parent)!r}"
         remedy = f"make it: mkdir -p {shlex.quote(str(path.parent))}"
     elif os.path.lexists(path) and not force:
@@ -214,11 +195,7 @@ def check_output(
 
 
 def bar(label: str, unit: str = "it") -> Progress[Any]:
-    """Return a function that wraps an iterable with a bar on stderr, shown after 1 s; where stderr
-    is no terminal, with a line every :data:`LINE_SECONDS`.
-    """
-    if not sys.stderr.isatty():
-        return partial(_lines, label, unit)
+    """Return a function that wraps an iterable with a bar on a terminal's stderr, shown after 1 s."""
     from tqdm import tqdm
 
     return partial(
@@ -226,22 +203,7 @@ def bar(label: str, unit: str = "it") -> Progress[Any]:
         desc=label,
         unit=unit,
         delay=1.0,
+        disable=None,
         leave=False,
         dynamic_ncols=True,
     )
-
-
-def _lines(label: str, unit: str, items: Collection[T]) -> Iterator[T]:
-    """Yield ``items``, with lines about how many are done."""
-    began = time.monotonic()
-    due = began + FIRST_SECONDS
-    total = len(items)
-    for count, item in enumerate(items):
-        now = time.monotonic()
-        if now >= due and count:
-            due = now + LINE_SECONDS
-            spent = now - began
-            left = spent * (total / count - 1)
-            text = f"{count} of {total} {unit}, {spent:.0f} s, about {left:.0f} s left"
-            print(f"batchpid: {label}: {text}", file=sys.stderr, flush=True)
-        yield item

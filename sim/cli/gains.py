@@ -33,13 +33,6 @@ ENDINGS = {
     "urdf": ".urdf",
 }
 """Suffix of the file of each target."""
-USED = {
-    "c": ("gains", "limits", "dynamics", "plan"),
-    "ros2_control": ("gains",),
-    "mjcf": ("gains",),
-    "urdf": (),
-}
-"""Flags that have an effect for each target, of those that only some have."""
 COMMENTS = {"c": "/* {} */", "mjcf": "<!-- {} -->", "urdf": "<!-- {} -->"}
 """Comment of a target's language; of the others "# {}"."""
 
@@ -141,21 +134,10 @@ def export(
         Field("seconds, not a rate: 1/1000", low=1e-6, high=1.0),
         flag("Time step of the control on the robot, or of the physics [s]."),
     ] = 1 / 1000,
-    limits: Annotated[
-        bool,
-        flag("In C, limit setpoints to the robot's limits and speeds before they reach the law."),
-    ] = False,
     prefix: Annotated[
         str,
         flag("Beginning of every name in the file; in ros2_control the name of the controller."),
     ] = "batchpid",
-    dynamics: Annotated[
-        bool, flag("In C, add the robot's mass matrix, gravity and bias as functions.")
-    ] = False,
-    plan: Annotated[
-        Path | None,
-        flag("In C, add a plan for chunks of a policy, from a file of `batchpid.save_plan`."),
-    ] = None,
 ) -> ExportedFile:
     """Write a robot's gains, or the robot itself, as a file for another program.
 
@@ -164,20 +146,11 @@ def export(
     motors, or with servos where --gains is given; "urdf" the robot with its repairs. Differences
     between the file and batchpid's law or the robot's file are printed, one line each.
     """
-    # A flag without effect is refused by name.
-    chosen = {
-        "gains": gains,
-        "limits": limits,
-        "dynamics": dynamics,
-        "plan": plan,
-    }
-    unused = [name for name, value in chosen.items() if value and name not in USED[to]]
-    if unused:
-        raise InvalidArgumentError(
-            unused[0], f"has no effect with --to {to}", remedy="leave it out"
-        )
     # The robot alone, or the law.
     if to == "urdf":
+        if gains is not None:
+            problem = "has no effect with --to urdf"
+            raise InvalidArgumentError("gains", problem, value=gains, remedy="leave it out")
         from batchpid.sim.robot.urdf_export import to_urdf
 
         return ExportedFile(to, partial(to_urdf, robot))
@@ -186,7 +159,6 @@ def export(
         return ExportedFile(to, lambda folder: exported)
     # The law: its joints are all of them in C, and the leaders alone in ros2_control.
     from batchpid.export import to_c, to_ros2_control
-    from batchpid.plan import load_plan
 
     params = law_gains(robot, gains)
     leaders = robot.independent
@@ -196,10 +168,7 @@ def export(
             params,
             timestep,
             joint_names=robot.joint_names,
-            guard=robot.guard() if limits else None,
             prefix=prefix,
-            tree=robot.kinematic_tree() if dynamics else None,
-            plan=None if plan is None else load_plan(plan, robot.joint_names)[0],
         )
         place = "separate joints in the file; ignore their efforts"
     else:

@@ -4,22 +4,19 @@ the same in one call. Their report: figures as a table and as a picture, and wha
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Document, Float64, Progress, Rows
 from batchpid.arrays.field_tables import Field
 from batchpid.checks import array
 from batchpid.errors import InvalidArgumentError
-from batchpid.plan import make_plan
-from batchpid.sim import OperationalSpace, Robot, Rollout, write_recording
+from batchpid.sim import Robot, Rollout, write_recording
 from batchpid.sim.cli.flags import BOUNDS, Engine, Gains, NumEnvs, Randomize, Workers, flag
 from batchpid.sim.diagnosis.causes import (
     cause_lines,
@@ -35,7 +32,6 @@ from batchpid.sim.tuning.evaluation import (
     step_response_metrics,
 )
 from batchpid.sim.tuning.gain_sets import gain_set
-from batchpid.task_space.frames import pose_error
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -44,20 +40,9 @@ NOT_SETTLED = 3
 """Exit status of `batchpid rollout` and `batchpid demo` where no env settles."""
 SHORTEST = 1.0
 """Shortest run in which envs should settle [s]."""
-AXIS_UNITS = {
-    "x": "m",
-    "y": "m",
-    "z": "m",
-    "rx": "rad",
-    "ry": "rad",
-    "rz": "rad",
-}
-"""Axes of the error of a pose, with their units."""
 COLUMNS = {
-    "first_error": ("first error", "{:.2g}"),
     "following_error": ("following error", "{:.2g}"),
     "steady_state_error": ("final error", "{:.2g}"),
-    "final_error": ("final error", "{:.2g}"),
     "overshoot": ("overshoot", "{:.0%}"),
     "settling_time": ("settled after", "{:.2f} s"),
     "saturation_share": ("saturated", "{:.0%}"),
@@ -69,8 +54,6 @@ ticks; settled: within 2 % of the move for good; overshoot: of joints that settl
 """
 SETPOINT_SUBSTEPS = 20
 """Sim steps of a tick, from one sample to the next, to a setpoint."""
-CHUNK_ROWS = 16
-"""Rows of a trajectory that enter a plan at once."""
 START_SPREAD = 0.3
 """Largest distance of a start pose from the first one [rad or m]."""
 Seconds = Annotated[
@@ -107,17 +90,12 @@ def rollout(
     engine: Engine = DEFAULT_ENGINE,
     workers: Workers = None,
     gains: Gains = None,
-    control: Annotated[
-        Literal["pid", "drive", "osc"],
-        flag("Batch PID, the engine's internal drive, or operational-space control of the tool."),
-    ] = "pid",
     setpoint: Annotated[
         tuple[float, ...] | None,
         flag(
-            "One position per joint [rad or m]; with --control osc x y z qw qx qy qz of the tool."
-            " Default: robot.target, the bundled robot's or, of another robot, a quarter of the way"
-            " from the start pose to the farther limit of each joint, at most 0.5; with --control"
-            " osc the pose of the tool there.",
+            "One position per joint [rad or m]. Default: robot.target, the bundled robot's or, of"
+            " another robot, a quarter of the way from the start pose to the farther limit of each"
+            " joint, at most 0.5.",
             "FLOAT [FLOAT ...]",
         ),
     ] = None,
@@ -131,10 +109,6 @@ def rollout(
             "FILE",
         ),
     ] = None,
-    by_plan: Annotated[
-        bool,
-        flag("Execute the rows of the trajectory by a plan: they may be slow, as 30 a second."),
-    ] = False,
     rates: Annotated[
         bool,
         flag(
@@ -152,9 +126,8 @@ def rollout(
     """Move N of any robot to a setpoint or along a trajectory; print a table.
 
     To a setpoint robots start from seeded poses. The recording holds time (ticks,), setpoint, qpos,
-    qvel, effort and saturated (ticks, envs, joints), ok (ticks, envs), with --control osc tool_pose
-    (ticks, envs, 7), and the robot's joint names, units and limits. The exit status is 3 if no
-    robot settles at its setpoint; the report says why.
+    qvel, effort and saturated (ticks, envs, joints), ok (ticks, envs), and the robot's joint names,
+    units and limits. The exit status is 3 if no robot settles at its setpoint; the report says why.
     """
     from batchpid.sim.runner.runner import Runner
 
@@ -165,36 +138,19 @@ def rollout(
         "timestep": timestep,
         "substeps": SETPOINT_SUBSTEPS,
         "randomization": randomization,
-        "control": control,
     }
-    # Gains, or the controller of a tool.
-    center: Rows = robot.start
-    goal: ArrayLike = robot.target
-    columns = robot.joint_names
-    if control == "osc":
-        _refuse("gains", gains, "are for the control of joints")
-        _refuse("trajectory", trajectory, "has joint setpoints, and excludes --control osc")
-        operational = OperationalSpace(robot, robot.kinematic_tree().tool, posture=robot.target)
-        options["control"] = operational
-        columns = operational.command.names
-        goal = operational.tool_pose(robot.target)
-        center = robot.target
-    elif gains is not None:
+    if gains is not None:
         # Without gains the Runner has its own default, which knows the loops of an MJCF file.
         chosen = gain_set(robot, gains)
-        options["params"] = chosen.params
-        if chosen.control == "drive":
-            options["control"] = "drive"
+        options |= {"params": chosen.params, "control": chosen.control}
 
     # Setpoints: one that is held, or the rows of a file.
     notes: list[str] = []
     inputs = Document()
-    meant: Rows | None = None
     if trajectory is None:
-        if by_plan:
-            _refuse("by_plan", True, "is for a trajectory")
-        goal = goal if setpoint is None else setpoint
-        row = array("setpoint", goal, (1, len(columns)), columns, kind="entry")[0]
+        goal = robot.target if setpoint is None else setpoint
+        row = array("setpoint", goal, (1, robot.dof), robot.joint_names)[0]
+        start = start_poses(robot, num_envs)
         # The metrics of a step need two ticks.
         ticks = max(2, round((seconds or 2.0) / (timestep * SETPOINT_SUBSTEPS)))
         setpoints = np.tile(row, (ticks, 1))
@@ -203,48 +159,36 @@ def rollout(
     else:
         from batchpid.sim.recording.setpoint_files import read_setpoints
 
-        _refuse("setpoint", setpoint, "is given by the trajectory")
-        _refuse("seconds", seconds, "is given by the trajectory")
-        motion = read_setpoints(robot, trajectory, None if by_plan else timestep)
+        for name, value in (("setpoint", setpoint), ("seconds", seconds)):
+            if value is not None:
+                problem = "is given by the trajectory"
+                raise InvalidArgumentError(name, problem, value=value, remedy="leave it out")
+        motion = read_setpoints(robot, trajectory, timestep)
         setpoints = motion.position
-        center = center if motion.start is None else motion.start
-        if by_plan:
-            _refuse("by_plan", None if rates else True, "makes the rates, and excludes --no-rates")
-            options["plan"] = make_plan(
-                robot.dof, period=motion.period, horizon=CHUNK_ROWS, blend="newest"
+        # A start off the trajectory would count as an error of following.
+        start = robot.start if motion.start is None else motion.start
+        options["substeps"] = motion.substeps
+        source = "central differences of the rows"
+        if motion.has_rates:
+            source = "from the file"
+        notes.append(f"Rates of the setpoints: {source if rates else 'not given'}.")
+        if rates:
+            inputs = {
+                "setpoint_rates": motion.rate,
+                "setpoint_accelerations": motion.acceleration,
+            }
+        if rates and motion.steps:
+            notes.append(
+                f"{motion.steps} steps of the setpoints exceed the velocity limits; their rate is 0."
             )
-            tick = timestep * SETPOINT_SUBSTEPS
-            knots = np.vstack([center, motion.position])
-            setpoints, ages, meant = _chunks(knots, motion.period, tick)
-            inputs = {"latency": np.repeat(ages[:, None], num_envs, 1)}
-            notes.append(f"Rows every {1000 * motion.period:.4g} ms, executed by a plan.")
-        else:
-            options["substeps"] = motion.substeps
-            source = "central differences of the rows"
-            if motion.has_rates:
-                source = "from the file"
-            notes.append(f"Rates of the setpoints: {source if rates else 'not given'}.")
-            if rates:
-                inputs = {
-                    "setpoint_rates": motion.rate,
-                    "setpoint_accelerations": motion.acceleration,
-                }
-            if rates and motion.steps:
-                notes.append(
-                    f"{motion.steps} steps of the setpoints exceed the velocity limits; their rate is 0."
-                )
 
     with Runner(robot, num_envs, **options) as runner:
         # The speed is that of the run alone, without the start of processes.
         began = time.perf_counter()
-        # A start off the trajectory would count as an error of following.
-        start = start_poses(robot, num_envs, START_SPREAD if trajectory is None else 0.0, center)
         runner.reset(start, seed=None if randomization is None else 0)
         result = runner.rollout(setpoints, progress=progress, **inputs)
         wall = time.perf_counter() - began
         backend = runner.backend
-    if meant is not None:
-        result = replace(result, setpoint=np.repeat(meant[:, None], num_envs, 1))
     return RunReport(
         robot,
         result,
@@ -256,47 +200,19 @@ def rollout(
     )
 
 
-def _chunks(knots: Rows, period: float, tick: float) -> tuple[Rows, Float64, Rows]:
-    """Return the chunks (ticks, 1, rows, dof) of ``knots`` (n + 1, dof), the first one at time 0,
-    their ages (ticks,) [s], infinite without a chunk, and the setpoints at the ends of ticks.
-    """
-    count = len(knots) - 1
-    times = tick * np.arange(max(2, math.ceil(count * period / tick)))
-    # The half of a chunk is executed before the next one comes.
-    step = CHUNK_ROWS // 2
-    numbers = np.floor(times / (step * period)).astype(int)
-    rows = np.minimum(step * numbers[:, None] + np.arange(CHUNK_ROWS), count)
-    is_new = np.diff(numbers, prepend=-1) > 0
-    ages = np.where(is_new, times - step * numbers * period, np.inf)
-    places = period * np.arange(count + 1)
-    meant = np.stack([np.interp(times + tick, places, column) for column in knots.T], 1)
-    return knots[rows][:, None], ages, meant
+def start_poses(robot: Robot, num_envs: int) -> Float64:
+    """Return poses (envs, dof) [rad or m] around the start pose, inside the limits; env 0 is that
+    pose itself.
 
-
-def start_poses(
-    robot: Robot,
-    num_envs: int,
-    spread: float,
-    center: Rows,
-) -> Float64:
-    """Return poses (envs, dof) [rad or m] around ``center``, inside the limits; env 0 is that pose
-    itself.
-
-    Uniform within ``spread`` [rad or m], and within a quarter of the joint's range where that is
+    Uniform within :data:`START_SPREAD`, and within a quarter of the joint's range where that is
     less. Row k is the same for any ``num_envs``.
     """
     random = np.random.default_rng(0)
-    reach = np.minimum(spread, (robot.upper - robot.lower) / 4)
-    poses = center + reach * random.uniform(-1.0, 1.0, (num_envs, robot.dof))
-    poses[0] = center
+    reach = np.minimum(START_SPREAD, (robot.upper - robot.lower) / 4)
+    poses = robot.start + reach * random.uniform(-1.0, 1.0, (num_envs, robot.dof))
+    poses[0] = robot.start
     coupled: Float64 = robot.coupling.positions(np.clip(poses, robot.lower, robot.upper))
     return coupled
-
-
-def _refuse(name: str, value: Any, problem: str) -> None:
-    """Raise InvalidArgumentError for a flag that is given."""
-    if value is not None:
-        raise InvalidArgumentError(name, problem, value=value, remedy="leave it out")
 
 
 @dataclass(frozen=True, eq=False)
@@ -335,43 +251,32 @@ class RunReport:
             return 0
         return NOT_SETTLED
 
-    def _columns(self) -> tuple[Sequence[str], Sequence[str], dict[str, Rows]]:
-        """Names and units of the joints, or of the axes of the tool, and their figures (envs,
-        joints).
-
-        The figures are errors of a tool's pose, following errors of setpoints that move, or metrics
-        of steps.
+    def _figures(self) -> dict[str, Rows]:
+        """Return the figures of the joints (envs, joints): following errors of setpoints that
+        move, or metrics of steps.
         """
         robot = self.robot
         rollout = self.rollout
-        ends = slice(-max(1, len(rollout.time) // 10), None)
-        # Poses of a tool have six errors, whatever the joints do.
-        if rollout.tool_pose is not None:
-            error = np.abs(pose_error(rollout.setpoint[..., :7], rollout.tool_pose.astype(float)))
-            figures = {"first_error": error[0], "final_error": error[ends].max(0)}
-            return list(AXIS_UNITS), list(AXIS_UNITS.values()), figures
         # A setpoint that moves is followed; one that is held is a step, with a settling time.
         if not self.is_held:
-            figures = {
-                "following_error": following_error(robot, rollout),
-                "final_error": following_error(robot, rollout.for_ticks(ends)),
-            }
+            figures = {"following_error": following_error(robot, rollout)}
             if rollout.info.control != "drive":
                 figures["saturation_share"] = rollout.saturated.mean(0)
-            return robot.joint_names, robot.units, figures
+            return figures
         start = robot.start
         if rollout.info.start is not None:
             start = rollout.info.start.astype(float)
         metrics = step_response_metrics(robot, rollout, start)
         overshoot = overshoot_of_settled(metrics.overshoot, metrics.settling_time)
-        return robot.joint_names, robot.units, metrics._asdict() | {"overshoot": overshoot}
+        return metrics._asdict() | {"overshoot": overshoot}
 
     def report(self) -> str:
         """Return the speed, a table of the joints, failed and unsettled envs, and causes."""
-        names, units, figures = self._columns()
+        robot = self.robot
+        figures = self._figures()
         shown = [column for column in COLUMNS if column in figures]
         rows = []
-        for joint, (name, unit) in enumerate(zip(names, units, strict=True)):
+        for joint, (name, unit) in enumerate(zip(robot.joint_names, robot.units, strict=True)):
             cells = [
                 median_and_worst(figures[column][:, joint], COLUMNS[column][1]) for column in shown
             ]
@@ -393,7 +298,7 @@ class RunReport:
         # A trajectory ends where it ends: its last setpoint need not be reached.
         if not self.is_held:
             causes = [cause for cause in causes if cause.code == "failed"]
-        elif not causes and self.rollout.tool_pose is None:
+        elif not causes:
             yield f"Every joint of every env settled within {self.seconds:g} s to 2 % of its move."
         yield from cause_lines(causes)
 

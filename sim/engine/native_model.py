@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,41 +21,7 @@ from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import DEADBEAT_SHARE, Friction, FrictionState
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import WIDTH, number, structure
-from batchpid.task_space.rigid_tree import RigidTree
-
-if TYPE_CHECKING:
-    from batchpid.sim.engine.protocol import EnginePack
-
-
-def passive_force(
-    tree: RigidTree,
-    qpos: Float64,
-    qvel: Float64,
-    gravity: bool,
-    coriolis: bool,
-    base: Float64 | None = None,
-) -> Float64:
-    """Return the gravity part of :func:`batchpid.task_space.bias` (n, dof), its velocity part, or
-    both.
-
-    ``base`` (n, 6) are gravity and the rate at which a floating base turns, in the base's axes; with
-    a tree on a fixed base, of a base that is held. The gravity part of a floating base is 0.
-    """
-    zero = np.zeros_like(np.asarray(qpos, np.float64))
-    turning = None
-    bodies = None
-    if base is not None:
-        turning = base[:, 3:]
-        bodies = tree.bodies._replace(gravity=base[:, :3])
-    force = zero
-    if coriolis or gravity:
-        force = ts.bias(
-            tree, qpos, qvel if coriolis else zero, turning if coriolis else None, bodies=bodies
-        )
-    if coriolis and not gravity:
-        force = force - ts.bias(tree, qpos, zero, bodies=bodies)
-    return np.asarray(force, np.float64)
-
+from batchpid.task_space.rigid_tree import Bodies, RigidTree
 
 ALIGNMENT = 64
 """Alignment of vectors in memory [bytes]."""
@@ -82,9 +48,69 @@ def table(rows: Rows, size: int) -> Float64:
     return out
 
 
-class NativeModel:
-    """Model of the robots of a ``tree``, on a base of this kind of Base in model.h, with ``inertias``
-    (robots, dof + 1, 13) where they differ: :meth:`RigidTree.inertias`.
+class TreeModel:
+    """Model of the robots of a ``tree`` in NumPy, whose base is "fixed", "held" where it is, or
+    "free": the definition of :class:`NativeModel`.
+    """
+
+    def __init__(self, tree: Callable[[], RigidTree], base: str = "fixed") -> None:
+        # Read at the first use: a robot with closed loops has no tree.
+        self._read = tree
+        self._base = base
+        self._bodies: Bodies | None = None
+
+    @cached_property
+    def _tree(self) -> RigidTree:
+        tree = self._read()
+        return tree if self._base == "free" else tree.held
+
+    def vary(self, rows: Sequence[int], added: Mapping[str, Float64]) -> None:
+        """Add spatial inertias (M, 6, 6) to links, by name, of M robots, of which ``rows`` change.
+
+        They are :func:`batchpid.task_space.frames.spatial_matrix`, in the axes of the
+        links.
+        """
+        self._bodies = self._tree.varied(added)
+
+    def mass_matrix(self, qpos: Rows) -> Float64:
+        """Return the mass matrices (n, dof, dof) [kg m^2 or kg] that the joints show at ``qpos``
+        (n, dof).
+        """
+        return np.asarray(ts.mass_matrix(self._tree, qpos, self._bodies), np.float64)
+
+    def passive_force(
+        self,
+        qpos: Float64,
+        qvel: Float64,
+        gravity: bool,
+        coriolis: bool,
+        base: Float64 | None = None,
+    ) -> Float64:
+        """Return the efforts (n, dof) [N m or N] that cancel gravity, and Coriolis and centrifugal
+        forces: parts of :func:`batchpid.task_space.bias`.
+
+        ``base`` (n, 6) are gravity [m/s^2] and the rate [rad/s] at which a base that is not fixed
+        turns, in its own axes: :meth:`batchpid.sim.engine.protocol.EnginePack.read_base_motion`.
+        The gravity part of a free base is 0.
+        """
+        tree = self._tree
+        bodies = self._bodies
+        zero = np.zeros_like(np.asarray(qpos, np.float64))
+        turning = None
+        if base is not None:
+            turning = base[:, 3:]
+            bodies = (bodies or tree.bodies)._replace(gravity=base[:, :3])
+        force = ts.bias(
+            tree, qpos, qvel if coriolis else zero, turning if coriolis else None, bodies=bodies
+        )
+        if not gravity:
+            force = force - ts.bias(tree, qpos, zero, bodies=bodies)
+        return np.asarray(force, np.float64)
+
+
+class NativeModel(TreeModel):
+    """Model in native code, with ``inertias`` (robots, dof + 1, 13) where they differ:
+    :meth:`RigidTree.inertias`.
     """
 
     def __init__(
@@ -93,17 +119,15 @@ class NativeModel:
         base: str = "fixed",
         inertias: Float64 | None = None,
     ) -> None:
-        # The tree is read at the first use: SAPIEN has to build a robot for it.
-        self._tree = tree
-        self._base = base
+        super().__init__(tree, base)
         self._native = native.extension("_gateway")
         self._inertias = inertias
 
     @cached_property
     def _structure(self) -> tuple[Any, Any]:
-        tree, rows = self._tree().tables
+        tree, rows = self._tree.tables
         if self._inertias is None:
-            inertias = self._tree().inertias()[None]
+            inertias = self._tree.inertias()[None]
         else:
             inertias = self._inertias
         arrays: dict[str, Rows] = {"tree": tree, "rows": rows, "inertias": inertias}
@@ -113,7 +137,7 @@ class NativeModel:
             "varies": self._inertias is not None,
             "base": number("Base", self._base.upper()),
         }
-        gravity = tuple(self._tree().bodies.gravity)
+        gravity = tuple(self._tree.bodies.gravity)
         return structure("Model")(
             gravity=gravity,
             **numbers,
@@ -123,23 +147,19 @@ class NativeModel:
     @property
     def tables(self) -> tuple[NDArray[np.int32], Float64]:
         """Tables of the tree: :attr:`.RigidTree.tables`."""
-        return self._tree().tables
+        return self._tree.tables
 
     @property
     def address(self) -> int:
         """Address of the model, for structures of the extension."""
         return ctypes.addressof(self._structure[0])
 
-    def vary(self, rows: Sequence[int], size: int, added: Mapping[str, Float64]) -> None:
-        """Add spatial inertias (size, 6, 6) to links, by name, of the robots ``rows`` of ``size``
-        in place.
-
-        They are :func:`batchpid.task_space.frames.spatial_matrix`, in the axes of the
-        links.
-        """
-        tree = self._tree()
+    def vary(self, rows: Sequence[int], added: Mapping[str, Float64]) -> None:
+        """Do :meth:`TreeModel.vary` in place, since native code has the address."""
+        tree = self._tree
         if self._inertias is None:
             # From now on the robots have different inertias.
+            size = len(next(iter(added.values())))
             self.__dict__.pop("_structure", None)
             self._inertias = np.tile(tree.inertias(), (size, 1, 1))
         picked = np.asarray(rows, np.intp)
@@ -147,9 +167,7 @@ class NativeModel:
         self._inertias[picked] = tree.inertias(varied)
 
     def mass_matrix(self, qpos: Rows) -> Float64:
-        """Return the mass matrices (n, dof, dof) [kg m^2 or kg] that the joints show at ``qpos``
-        (n, dof).
-        """
+        """Return :meth:`TreeModel.mass_matrix`."""
         rows = np.ascontiguousarray(qpos, np.float64)
         out = np.empty((*rows.shape, rows.shape[1]))
         self._native.joint_matrices(self.address, rows, out, len(rows))
@@ -163,12 +181,7 @@ class NativeModel:
         coriolis: bool,
         base: Float64 | None = None,
     ) -> Float64:
-        """Return the efforts (n, dof) [N m or N] that cancel gravity, and Coriolis and centrifugal
-        forces.
-
-        ``base`` (n, 6) are gravity [m/s^2] and the rate [rad/s] at which a base that is not fixed
-        turns, in its own axes: :meth:`batchpid.sim.engine.protocol.EnginePack.read_base_motion`.
-        """
+        """Return :meth:`TreeModel.passive_force`."""
         state = [
             None if rows is None else np.ascontiguousarray(rows, np.float64)
             for rows in (qpos, qvel, base)
@@ -259,8 +272,7 @@ class NativeStep:
     """Sim step of ``robots`` with ``dof`` joints as one native call, from Python or from an XLA
     program.
 
-    ``arrays`` and ``fields`` fill a Group of sim_step.h; a joint speed beyond ``speed_limit``
-    (dof,) shows in the status.
+    ``arrays`` and ``fields`` fill a Group of sim_step.h.
     """
 
     def __init__(
@@ -268,12 +280,9 @@ class NativeStep:
         robots: int,
         dof: int,
         arrays: Mapping[str, Rows],
-        speed_limit: Float64 | None,
         **fields: object,
     ) -> None:
         self._arrays = dict(arrays)
-        if speed_limit is not None:
-            self._arrays["speed_limit"] = np.broadcast_to(speed_limit, dof).astype(np.float64)
         addresses = {name: array.ctypes.data for name, array in self._arrays.items()}
         self._native = native.extension("_gateway")
         self._group = structure("Group")(
@@ -303,27 +312,3 @@ class NativeStep:
         if status and status & number("Status", "FAILED"):
             raise RuntimeError(self._group.message.decode(errors="replace"))
         return bool(status)
-
-
-def mass_matrix_of(pack: EnginePack, natively: bool) -> Callable[[Float64], Float64]:
-    """Return the function of positions that computes the mass matrices of a pack's model, on a
-    fixed base.
-
-    ``natively`` says whether the extension is used; then every executor takes them from it, since
-    NumPy's differ in the last bits.
-    """
-    if natively:
-        return NativeModel(lambda: pack.rigid_tree).mass_matrix
-    return lambda qpos: ts.mass_matrix(pack.rigid_tree.held, qpos)
-
-
-def passive_force_of(pack: EnginePack, natively: bool) -> Callable[..., Float64]:
-    """Return the function of positions, velocities, gravity, coriolis and base that computes the
-    passive forces of a pack's model.
-
-    The base is fixed, or held where it is. ``natively`` says whether the extension is used; then
-    every executor takes them from it, since the engines' and NumPy's differ in the last bits.
-    """
-    if natively:
-        return pack.force_model.passive_force
-    return lambda *state: passive_force(pack.rigid_tree.held, *state)

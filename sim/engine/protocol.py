@@ -20,14 +20,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-import batchpid.task_space as ts
 from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.checks import choice
 from batchpid.errors import InvalidArgumentError, MissingDependencyError, SingleOwner
 from batchpid.io.files import imported
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
-from batchpid.sim.engine.native_model import NativeModel, NativeStep, passive_force_of
+from batchpid.sim.engine.native_model import NativeModel, NativeStep, TreeModel
 from batchpid.sim.engine.scene_spec import (
     SceneSpec,
     Variation,
@@ -36,12 +35,11 @@ from batchpid.sim.engine.scene_spec import (
     own_friction,
 )
 from batchpid.sim.findings import Finding
-from batchpid.task_space.rigid_tree import RigidTree
 
-Capability = Literal["build", "partial_force", "base_state", "complete_state", "sapien_dissipation"]
+Capability = Literal["build", "wrenches", "base_state", "complete_state", "sapien_dissipation"]
 """
 - ``"build"``: the user's function ``build`` adds content to scenes;
-- ``"partial_force"``: compiled steps read gravity or Coriolis forces alone;
+- ``"wrenches"``: links sense the wrench of their parent;
 - ``"base_state"``: compiled steps read state and passive force of robots on a floating base;
 - ``"complete_state"``: :meth:`EnginePack.read_state` holds everything that later steps depend on, so
   that a pack in use can be restored, and a snapshot changes no bit;
@@ -76,7 +74,7 @@ class EnginePack(SingleOwner, ABC):
         them.
     armature
         Reflected inertia of the motors (1 | M, dof) [kg m^2 or kg], not included in
-        :meth:`joint_mass_matrix`.
+        :attr:`joint_model`.
     steps_natively
         Whether native code does the sim steps, by :meth:`compiled_step`.
     content
@@ -110,49 +108,36 @@ class EnginePack(SingleOwner, ABC):
         self._constraint: ConstraintEfforts | None = None
 
     @property
-    def rigid_tree(self) -> RigidTree:
-        """Tree of the robots as the engine has them, all joints independent."""
-        return self.spec.rigid_tree
-
-    @property
     def _is_model(self) -> bool:
         """Whether the robots have the masses and the gravity of the model."""
         return not self._masses.added and self._variation.gravity is None
 
+    def _model(self, base: str) -> Any:
+        """Return a model of the robots; native where calls are, since NumPy's differs in the last
+        bits.
+        """
+        kind = NativeModel if self.steps_natively else TreeModel
+        return kind(lambda: self.spec.rigid_tree, "fixed" if self.spec.fixed_base else base)
+
     @cached_property
-    def joint_model(self) -> NativeModel:
-        """Native model of :meth:`joint_mass_matrix`."""
-        model = NativeModel(lambda: self.rigid_tree, "fixed" if self.spec.fixed_base else "free")
+    def joint_model(self) -> Any:
+        """Model of the present robots, :class:`.TreeModel`; a floating base moves with the
+        joints.
+        """
+        model = self._model("free")
         if self._masses.added:
-            model.vary(range(self.size), self.size, self._masses.added)
+            model.vary(range(self.size), self._masses.added)
         return model
 
     @cached_property
-    def force_model(self) -> NativeModel:
-        """Native model of the passive force, for compiled steps that do not read it in the
-        engine.
-        """
-        return NativeModel(lambda: self.rigid_tree, "fixed" if self.spec.fixed_base else "held")
+    def force_model(self) -> Any:
+        """Model of ``spec`` alone, :class:`.TreeModel`, on a base that is held."""
+        return self._model("held")
 
-    def joint_mass_matrix(self, qpos: Rows) -> Float64:
-        """Return the mass matrices of the joints at ``qpos`` (M, dof, dof) [kg m^2 or kg]; a
-        floating base moves with them.
-        """
-        if self.steps_natively:
-            return self.joint_model.mass_matrix(qpos)
-        added = self._masses.added
-        return ts.mass_matrix(
-            self.rigid_tree, qpos, self.rigid_tree.varied(added) if added else None
-        )
-
-    @cached_property
-    def _passive_force(self) -> Callable[..., Float64]:
-        return passive_force_of(self, self.steps_natively)
-
-    def _model_force(self, gravity: bool, coriolis: bool) -> Float64:
-        """Return the passive force, computed from the model."""
+    def _force(self, model: TreeModel, gravity: bool, coriolis: bool) -> Float64:
+        """Return the passive force of a model at the present state."""
         state = self.read_qpos(), self.read_qvel(), gravity, coriolis, self.read_base_motion()
-        return self._passive_force(*state)
+        return model.passive_force(*state)
 
     @property
     def _constraint_address(self) -> int | None:
@@ -165,9 +150,9 @@ class EnginePack(SingleOwner, ABC):
                 mine[rows] = new
 
     def _change_model(self, rows: Sequence[int]) -> None:
-        """Update the masses of the robots ``rows`` in the native code's model."""
+        """Update the masses of the robots ``rows`` in the model."""
         if self._masses.added and "joint_model" in self.__dict__:
-            self.joint_model.vary(rows, self.size, self._masses.added)
+            self.joint_model.vary(rows, self._masses.added)
 
     def _add_joints(self, actuators: Actuators | None) -> Float64:
         """Set friction and armature of ``actuators``; return the inertia that the engine has to add
@@ -244,9 +229,9 @@ class EnginePack(SingleOwner, ABC):
         """
 
     @abstractmethod
-    def take_sensed(self) -> dict[str, Float64]:
-        """Return the sums of the link sensors over all sim steps since the last call, and reset
-        them.
+    def take_sensed(self, steps: int) -> dict[str, Rows]:
+        """Return the means of the link sensors over the last ``steps`` sim steps, all since the
+        last call.
 
         ``contact_force`` (M, links, 3), ``touching`` (M, links), 0 without a contact, and
         ``wrench`` (M, links, 6), as :class:`batchpid.sim.Observation` describes them; of robots
@@ -342,18 +327,11 @@ class EnginePack(SingleOwner, ABC):
         """
 
     @abstractmethod
-    def compiled_step(
-        self,
-        gravity: bool,
-        coriolis: bool,
-        speed_limit: Float64 | None,
-        drives: bool = False,
-    ) -> NativeStep:
+    def compiled_step(self, gravity: bool, coriolis: bool, drives: bool = False) -> NativeStep:
         """Return the sim step of the present robots.
 
         ``gravity`` and ``coriolis`` select the parts of the passive force that it reads; without
-        both it is zero. The status reports speeds above ``speed_limit`` (dof,), if given. With
-        ``drives`` the targets of the drives may move within a tick.
+        both it is zero. With ``drives`` the targets of the drives may move within a tick.
         """
 
     @abstractmethod
@@ -405,12 +383,15 @@ class Engine:
 
 
 def require(engine: Engine, capability: Capability, argument: str) -> None:
-    """Raise InvalidArgumentError for ``argument`` if ``engine`` lacks ``capability``, which SAPIEN
-    has.
+    """Raise InvalidArgumentError for ``argument`` if ``engine`` lacks ``capability``, which the
+    other one has.
     """
     if capability not in engine.capabilities:
         problem = f"needs the capability {capability!r}, which engine {engine.name!r} does not have"
-        raise InvalidArgumentError(argument, problem, remedy="omit it, or use the engine 'sapien'")
+        other = next(name for name in MODULES if name != engine.name)
+        raise InvalidArgumentError(
+            argument, problem, remedy=f"omit it, or use the engine {other!r}"
+        )
 
 
 MODULES = {

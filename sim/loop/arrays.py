@@ -7,13 +7,11 @@ neither read nor written. So every continuation from a snapshot, in this process
 starts in a new world in that state, and the results are bit-identical. The barrier itself changes
 the last bits.
 
-``Runner.restore`` checks names, shapes and dtypes of the arrays against the runner's own.
+:meth:`Snapshot.check_rows` checks names, shapes and dtypes of the arrays against the runner's own.
 """
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter
@@ -24,11 +22,11 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Rows
-from batchpid.checks import file_path, integer
 from batchpid.errors import InvalidArgumentError
-from batchpid.io.files import write_atomically
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.signals import Observation
+from batchpid.stages import STAGES
+from batchpid.stages.law import Own
 from batchpid.stages.values import Command
 
 Layout = dict[str, tuple[tuple[int, ...], Any]]
@@ -92,15 +90,12 @@ class Arrays(NamedTuple):
         )
 
 
-_FORMAT = 18
 _SAME_CONTENT = "take one with the same build=, and keep each env's number where it depends on it"
 
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """State of all envs of a runner at one moment. It can be pickled, or kept in a file:
-    :meth:`save`, :meth:`load`.
-    """
+    """State of all envs of a runner at one moment. ``pickle`` keeps it in a file."""
 
     about: Document
     """Options that a runner must share to restore it:
@@ -126,15 +121,23 @@ class Snapshot:
             raise InvalidArgumentError("snapshot", problem, remedy="take one with the same options")
 
     def check_rows(self, own: Mapping[str, Rows]) -> None:
-        """Check names, shapes and dtypes of the arrays against the runner's ``own``.
+        """Check names, shapes and dtypes of the arrays against the runner's ``own``: but for the
+        states of batchpid's stages, which follow from the params and actuators.
 
         Raises
         ------
         InvalidArgumentError
             An array is missing, unknown, or of another shape or dtype, or an env has other content.
         """
+        decided = {kind.name for kind in STAGES}
+        if self.about["control"] not in ("pid", "drive", "effort"):
+            decided.remove(Own.name)
         theirs, ours = (
-            {name: f"{table.dtype.str} {table.shape}" for name, table in rows.items()}
+            {
+                name: f"{table.dtype.str} {table.shape}"
+                for name, table in rows.items()
+                if not (name.startswith("control/") and name.split("/")[1] in decided)
+            }
             for rows in (self.rows, own)
         )
         for name in ours | theirs:
@@ -148,14 +151,6 @@ class Snapshot:
         # The engine's values of an env end where NaN begin.
         lengths = np.isnan(self.rows["engine"]) == np.isnan(own["engine"])
         _expect(lengths.all(), "holds other content than this runner's build makes", _SAME_CONTENT)
-
-    def episodes(self, num_envs: int) -> NDArray[np.int64]:
-        """Return the checked stream and episode of each of ``num_envs`` envs."""
-        episodes = self.rows.get("episodes", np.zeros(0))
-        is_table = episodes.shape == (num_envs, 2) and episodes.dtype == np.int64
-        is_valid = is_table and (episodes >= 0).all()
-        _expect(is_valid, "has no valid episode numbers", "take another: this one is damaged")
-        return episodes
 
     def for_envs(self, envs: slice | Sequence[int] | Rows) -> Snapshot:
         """Return a snapshot of the envs with these numbers, in this order, and repeatedly where a
@@ -182,60 +177,6 @@ class Snapshot:
     def copy(self) -> Snapshot:
         """Return a snapshot with arrays of its own."""
         return self.for_envs(slice(None))
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write an .npz file, as a whole or not at all: an older file stays until this one is
-        complete.
-
-        Raises
-        ------
-        OSError
-            The file cannot be written.
-        """
-        joints = self.about["joints"]
-        head = {"format": _FORMAT, "about": self.about, "steps": self.steps}
-        head["params"] = bp.dumps_params(self.params, joints, format="json")
-        if self.actuators is not None:
-            head["actuators"] = bp.motors.dumps_actuators(self.actuators, joints, format="json")
-        tables: Document = {"head": np.array(json.dumps(head))} | self.rows
-        write_atomically(file_path("path", path), lambda file: np.savez(file, **tables))
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Snapshot:
-        """Read a file of :meth:`save`. Nothing in it is executed.
-
-        Raises
-        ------
-        InvalidArgumentError
-            The file is missing, damaged, or no snapshot of this version.
-        """
-        path = file_path("path", path)
-        try:
-            if not path.is_file():
-                raise ValueError("there is no such file")
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as tables:
-                return cls._read(dict(tables))
-        except Exception as error:  # a damaged file can make the libraries raise anything
-            raise InvalidArgumentError(
-                "path",
-                f"cannot be read as a snapshot: {error or type(error).__name__}",
-                value=str(path),
-                remedy="pass a file that Snapshot.save wrote",
-            ) from error
-
-    @classmethod
-    def _read(cls, rows: dict[str, Rows]) -> Snapshot:
-        """Return the snapshot in the arrays of a file."""
-        head = json.loads(str(rows.pop("head")))
-        if head["format"] != _FORMAT:
-            raise ValueError(f"format {head['format']}, not {_FORMAT}")
-        about: Document = dict(head["about"])
-        steps = integer("steps", head["steps"], 0, 2**62)
-        params, _ = bp.loads_params(head["params"], about["joints"])
-        actuators = None
-        if "actuators" in head:
-            actuators, _ = bp.motors.loads_actuators(head["actuators"], about["joints"])
-        return cls(about, steps, params, rows, actuators)
 
     def __repr__(self) -> str:
         about = self.about

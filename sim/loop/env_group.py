@@ -257,7 +257,7 @@ class EnvGroup:
                 if self._pushes.push(self.pack, *inputs):
                     executor.measure()
             if self._sensed:
-                self.pack.take_sensed()  # those of the ticks before
+                self.pack.take_sensed(1)  # those of the ticks before
             if self._faults.suspended.any() or not are_finite(*command):
                 command = self._faults.contained(command, before + 1, executor.measured.qpos)
                 self._place_failed()
@@ -286,9 +286,9 @@ class EnvGroup:
         """Take the means of the link sensors over a tick of ``substeps`` sim steps, 0 for envs that
         failed.
         """
-        for name, sums in self.pack.take_sensed().items():
+        for name, means in self.pack.take_sensed(substeps).items():
             shown = self._shown[name]
-            shown[...] = sums > 0 if shown.dtype == bool else sums / substeps
+            shown[...] = means
             shown[self._faults.failed] = 0
 
     def observe(self, rows: Arrays) -> None:
@@ -405,8 +405,7 @@ class EnvGroup:
         if returned is not None:
             params = self._executor.setup.control.params
             returned = clip(returned, params.effort_min, params.effort_max, np)
-        limit = self._options.speed_limit
-        self._faults.fail_state(self.pack, step, before, returned, limit)
+        self._faults.fail_state(self.pack, step, before, returned)
         self._place_failed()
 
     def _place_failed(self) -> None:

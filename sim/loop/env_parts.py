@@ -134,12 +134,11 @@ class OwnController:
         self._options = options
         self._controller = options.control
         self.name = type(options.control).__name__
-        if isinstance(options.control, OperationalSpace):
-            self._reporting = options.control.reporting
-            self.implicit = options.control.params.discretization is not None
-        else:
-            self._reporting = None
-            self.implicit = False
+        self.implicit = getattr(options.control, "implicit", False)
+        self._reporting: Callable[..., tuple[Array, ...]] | None = None
+        # The law of a subclass is its __call__.
+        if type(options.control) is OperationalSpace:
+            self._reporting = options.control.advance
         self._structure: Any = None
 
     def init(self, envs: int) -> dict[str, Rows]:

@@ -13,29 +13,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Array, Bool, Float64, Rows
+from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.sim.engine.native import FARTHEST
 from batchpid.sim.engine.protocol import BASE_AT_REST, EnginePack
 from batchpid.sim.loop.arrays import Arrays, FaultArrays
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.stages.values import Command
 
-CAUSES = (
-    "state",
-    "speed",
-    "setpoint",
-    "setpoint_rate",
-    "feedforward",
-    "qpos",
-    "qvel",
-    "effort",
-    "setpoint_acceleration",
-)
-"""Causes of faults: the state is not finite or a position beyond :data:`FARTHEST`, a joint is too
-fast, or the array of that name was not finite.
-
-"effort" is the effort that the caller's own controller returned. Snapshots hold indices of causes,
-so new causes are appended at the end.
+CAUSES = ("state", "effort", "qpos", "qvel", *Command._fields)
+"""Causes of faults: the state is not finite or a position beyond :data:`FARTHEST`, or the array of
+that name was not finite. "effort" is the effort that the caller's own controller returned.
 """
 COMMAND_CAUSES = ("setpoint", "setpoint_rate", "setpoint_acceleration")
 """Causes in an entry of the command, which need not be a joint."""
@@ -68,7 +55,6 @@ class Fault(NamedTuple):
     def __str__(self) -> str:
         texts = {
             "state": f"its state is not finite, or a position is beyond {FARTHEST:,.0f} rad or m",
-            "speed": "it is faster than speed_limit",
             "effort": "the effort that its controller returned is not finite",
         }
         cause = texts.get(self.cause, f"its {self.cause} is not finite")
@@ -83,9 +69,7 @@ class Fault(NamedTuple):
 
 
 class FaultWarning(UserWarning):
-    """An env failed: its state is not finite, a position is beyond :data:`FARTHEST`, or a joint is
-    too fast.
-    """
+    """An env failed: its state is not finite, or a position is beyond :data:`FARTHEST`."""
 
 
 class FaultContainment:
@@ -196,10 +180,9 @@ class FaultContainment:
         step: int,
         before: Float64,
         returned: Float64 | None,
-        speed_limit: Array,
     ) -> None:
-        """Record the faults of envs whose state is not finite, too far or too fast after sim step
-        ``step``; ``before`` are the positions before it (M, dof).
+        """Record the faults of envs whose state is not finite or too far after sim step ``step``;
+        ``before`` are the positions before it (M, dof).
 
         ``returned`` is the effort of the caller's own controller, within the limits; or None.
         """
@@ -214,13 +197,6 @@ class FaultContainment:
             wrong = ~np.isfinite(returned) | ~np.isfinite(pack.qf)
             self.fail(wrong & failed, "effort", step, before)
         self.fail(bad, "state", step, before)
-        if speed_limit is not None:
-            self.fail(
-                (np.abs(qvel) > speed_limit) & ~failed,
-                "speed",
-                step,
-                before,
-            )
 
     def pop_unplaced(self) -> Bool:
         """Return the envs that failed since the last call (M,), which are to be placed."""

@@ -7,6 +7,7 @@ NumPy's results differ in the last bits.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +20,7 @@ from batchpid.motors.friction import Friction
 from batchpid.native.extensions import MOST_SUMMED
 from batchpid.sim.description.merging import coupling_of
 from batchpid.sim.engine import native
-from batchpid.sim.engine.native_model import NativeRefresh, mass_matrix_of, passive_force_of
+from batchpid.sim.engine.native_model import NativeRefresh
 from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.env_parts import OwnController
 from batchpid.sim.options.options import RunnerOptions
@@ -27,7 +28,7 @@ from batchpid.sim.robot.robot_options import FRICTION_BAND, known_joints
 from batchpid.sim.tool_space import OperationalSpace
 from batchpid.stages import Control, Stage, stages_of
 from batchpid.stages.friction import REFRESH_STEPS
-from batchpid.stages.stage import States, bind_stages, started
+from batchpid.stages.stage import bind_stages
 from batchpid.stages.values import Command, Measured, Model, Outputs, Step, Values
 
 
@@ -160,32 +161,12 @@ def _for_envs(stage: Stage, num_envs: int, envs: slice) -> Stage:
     return part
 
 
-def empty_control(
-    options: RunnerOptions,
-    params: bp.PIDParams,
-    actuators: bp.Actuators | None,
-) -> tuple[tuple[Any, ...], States, Values]:
-    """Return the stages of all envs of a runner, their states, and the values that a stage may read,
-    all 0. No robots are made.
-
-    ``params`` and ``actuators`` include the draws of the randomization.
+@lru_cache(maxsize=8)
+def untraceable(options: RunnerOptions) -> str:
+    """Return which of the caller's stages cannot run in native code, and why; "" if all can. No
+    robots are made.
     """
     rows = np.zeros((options.num_envs, options.robot.dof))
-    controller = None if isinstance(options.control, str) else OwnController(options)
-    stiction = options.has_stiction(actuators)
-    control = control_of(
-        options,
-        params,
-        actuators,
-        Friction(coulomb=rows if stiction else None),
-        slice(0, options.num_envs),
-        controller,
-    )
-    stages = stages_of(control)
-    model = Model(
-        joint_mass_matrix=lambda qpos: np.eye(rows.shape[1]) + 0.0 * qpos[:, :, None],
-        load=lambda: rows,
-    )
     measured = Measured(rows, rows, rows)
     values = Values(
         command=Command(*[rows] * 4),
@@ -198,21 +179,12 @@ def empty_control(
         limits=(rows, rows),
         outputs=Outputs(*[rows] * 4),
     )
-    return stages, started(stages, values._replace(model=model)), values
-
-
-def untraceable(options: RunnerOptions) -> str:
-    """Return which of the caller's stages cannot run in native code, and why; "" if all can."""
-    stages, states, values = empty_control(options, options.params, options.actuators)
-    shape = values.forward.shape
-    names = {stage.name for stage in options.stages}
-    for stage, state in zip(stages, states, strict=True):
-        if stage.name not in names:
-            continue
-        if any(leaf.shape != shape for leaf in leaves(state)):
+    for stage in options.stages:
+        state, _ = stage.init(values)
+        if any(leaf.shape != rows.shape for leaf in leaves(state)):
             return f"the state of stage {stage.name!r} is not (envs, joints)"
         try:
-            bind_stages([stage], (state,), values, shape)
+            bind_stages([stage], (state,), values, rows.shape)
         except (AttributeError, AssertionError, TypeError, ValueError) as error:
             return f"stage {stage.name!r}: {error}"
     return ""
@@ -263,22 +235,23 @@ def model_functions(pack: EnginePack, control: Control) -> Model:
     falls = not pack.spec.fixed_base  # then gravity does not load the joints
 
     def joint_mass_matrix(qpos: Float64) -> Float64:
-        matrix = pack.joint_mass_matrix(qpos)
+        matrix: Float64 = pack.joint_model.mass_matrix(qpos)
         if pack.armature.any():
             return matrix + pack.armature[:, None] * np.eye(pack.dof)
         return matrix
 
     model = Model(
-        mass_matrix=mass_matrix_of(pack, native),
+        mass_matrix=lambda qpos: pack.force_model.mass_matrix(qpos),
         joint_mass_matrix=joint_mass_matrix,
         load=lambda: pack.passive_force(not falls, True),
         envs=np.arange(pack.first_env, pack.first_env + pack.size),
     )
     if control.gravity:
-        force = passive_force_of(pack, native)
         parts = control.gravity, control.coriolis
         model = model._replace(
-            passive_force=lambda qpos, qvel: force(qpos, qvel, *parts, pack.read_base_motion())
+            passive_force=lambda qpos, qvel: pack.force_model.passive_force(
+                qpos, qvel, *parts, pack.read_base_motion()
+            )
         )
     if native and control.friction.coulomb is not None:
         inputs = control.friction, control.drive, control.coupling, control.timestep

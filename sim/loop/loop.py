@@ -145,10 +145,10 @@ class Loop:
         try:
             if method == "run":
                 return self.run(*arguments)
-            calls = [
+            results = [
                 getattr(group, method)(*part_of(arguments, group.rows)) for group in self.groups
             ]
-            return joined(method, calls)
+            return joined(method, results)
         except Exception as error:
             return failed(error)
 

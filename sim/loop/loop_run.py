@@ -111,9 +111,9 @@ class Lanes:
 
     def __init__(self, loop: ClosedLoop, qpos: Float64, qvel: Float64) -> None:
         plant: Any = loop.plant
-        self.rigid_tree = loop.tree
+        tree = loop.tree
         self.size, self.dof = qpos.shape
-        self.force_model = NativeModel(lambda: self.rigid_tree)
+        self.force_model = NativeModel(lambda: tree)
         self.joint_model = self.force_model
         self.steps_natively = True
         self.spec = SimpleNamespace(fixed_base=True)
@@ -126,9 +126,7 @@ class Lanes:
         self._start = qpos, qvel
         self._group = structure("Group")(robots=self.size, dof=self.dof)
         if plant.bodies.mass.ndim > 2:
-            self.joint_model = NativeModel(
-                lambda: self.rigid_tree, inertias=self.rigid_tree.inertias(plant.bodies)
-            )
+            self.joint_model = NativeModel(lambda: tree, inertias=tree.inertias(plant.bodies))
         least, most, width = IMPEDANCE
         blocks = -(-self.size // WIDTH)
         arrays = {

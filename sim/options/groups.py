@@ -10,16 +10,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple, Protocol, Self, get_args, get_type_hints
 
-from numpy.typing import ArrayLike
-
 import batchpid as bp
-from batchpid.arrays.array_types import Array, Document, Rows
-from batchpid.arrays.elementwise import read_only, require_jax
+from batchpid.arrays.array_types import Array, Rows
+from batchpid.arrays.elementwise import require_jax
 from batchpid.arrays.field_tables import Field, plain
-from batchpid.checks import array, at_least, choice, instance, names
+from batchpid.checks import choice, instance, names
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.description.merging import place_links
 from batchpid.sim.description.tables import MjcfFile
@@ -166,12 +164,11 @@ class SceneOptions(OptionGroup):
     """
     contacts: Annotated[Sequence[str] | None, option("snapshot", "recording", "scene")] = None
     """Links whose contact forces are observed: ``obs.contact_force`` and ``obs.touching``; default
-    none. Each link senses the contacts of its own shapes. A fixed base is refused. SAPIEN needs
-    ``dissipation="urdf"``.
+    none. Each link senses the contacts of its own shapes. A fixed base is refused.
     """
     wrenches: Annotated[Sequence[str] | None, option("snapshot", "recording", "scene")] = None
     """Links with a sensor of the force and torque that the parent exerts on the link:
-    ``obs.wrench``; default none. SAPIEN needs ``dissipation="urdf"``.
+    ``obs.wrench``; default none. It needs ``engine="mujoco"``.
     """
     build: Annotated[Callable[[Any, int], Any] | None, option("snapshot", "scene")] = None
     """Function ``build(scene, env)`` that adds user content to the ``sapien.Scene`` of each env;
@@ -286,11 +283,8 @@ class SceneOptions(OptionGroup):
         links = tuple(names(argument, value))
         if not links:
             return None
-        # SAPIEN reports its damping of links among the contacts.
-        if self.engine == "sapien" and robot.source.dissipation == "sapien":
-            problem = "need a robot without SAPIEN's link damping, which acts like a contact"
-            remedy = "load the robot with dissipation='urdf'"
-            raise InvalidArgumentError(argument, problem, remedy=remedy)
+        if argument == "wrenches":
+            require(self.load_engine(), "wrenches", argument)
         # A link that no joint moves has no sensor: it is part of the root's body.
         bodies = place_links(robot.tables, links if argument == "wrenches" else ())
         root = next(place.link for place in bodies.values())
@@ -428,11 +422,8 @@ class ControlOptions(OptionGroup):
     """Action when an env fails: ``"hold"`` (default) keeps it at rest in its last valid state, with
     ``ok`` False until it is reset; ``"reset"`` returns it to its last start, with ``ok`` False for
     that tick. An env fails when its state, or the effort of a :class:`Controller`, is not finite,
-    when a position is beyond 1e6 rad or m, or by ``speed_limit``. The other envs are not
-    affected.
+    or when a position is beyond 1e6 rad or m. The other envs are not affected.
     """
-    speed_limit: Annotated[ArrayLike | None, option("snapshot")] = None
-    """Joint speed at which an env fails, scalar or (dof,) [rad/s or m/s]; default none."""
     on_invalid_input: Annotated[InvalidInputAction, option("next commands")] = "raise"
     """Response to NaN or infinity in a command or in a pose to reset to: ``"raise"`` (default)
     raises an error, and ``"contain"`` lets only the env concerned fail.
@@ -474,18 +465,7 @@ class ControlOptions(OptionGroup):
         for name in names("free_joints", free):
             choice("free_joints", name, robot.joint_names)
         values = {"free_joints": tuple(free), "stages": fit_stages(self.stages)}
-        limit = self.speed_limit
-        joints = robot.joint_names
-        if limit is not None:
-            # A copy: the caller may change the array later.
-            speeds = array("speed_limit", limit, (1, robot.dof), joints)[0].copy()
-            limit = read_only(at_least("speed_limit", speeds, 0.0, joints, above=True))
-        return self.changed(
-            control=control,
-            tool=link,
-            speed_limit=limit,
-            **values,
-        )
+        return self.changed(control=control, tool=link, **values)
 
     @property
     def control_name(self) -> str:
@@ -505,42 +485,6 @@ class ControlOptions(OptionGroup):
     def sets_positions(self) -> bool:
         """True if setpoints are joint positions."""
         return self.control in ("pid", "drive")
-
-
-@dataclass(frozen=True, eq=False)
-class Ray:
-    """Ray cluster, for the option ``cluster`` of :class:`batchpid.sim.Runner`; ``"ray"`` means
-    ``Ray()``.
-
-    Raises
-    ------
-    InvalidArgumentError
-        An option is out of range.
-    """
-
-    address: str | None = None
-    """Address of the cluster, "HOST:PORT" as ``ray start`` prints it, or "local" for a new one of
-    this machine alone, which ends with this process. Default: the environment variable RAY_ADDRESS,
-    else a cluster that runs on this machine, else "local".
-    """
-    _: KW_ONLY
-    nodes: Annotated[int | None, Field(low=1, high=100_000)] = None
-    """Largest number of machines. Default: all that have enough CPUs."""
-    cpus_per_node: Annotated[int | None, Field(low=1, high=100_000)] = None
-    """Workers on each machine, each on one CPU of Ray's count. Machines with fewer CPUs are not
-    used, except after a loss. Default: the CPUs of the smallest machine that is used; small ones
-    are left out where that gives more workers.
-    """
-    runtime_env: Document | None = None
-    """Ray's ``runtime_env`` of the processes on the machines, such as ``{"working_dir": "."}``."""
-
-    def __post_init__(self) -> None:
-        check_plain(self)
-        instance("runtime_env", self.runtime_env or {}, dict, "pass a dict")
-        remedy = "pass HOST:PORT, 'auto' or 'local'"
-        address = instance("address", self.address or "", str, remedy)
-        if "://" in address:
-            raise InvalidArgumentError("address", "has a protocol", value=address, remedy=remedy)
 
 
 @dataclass(
@@ -571,14 +515,9 @@ class WorkerOptions(OptionGroup):
     """Time [s], beyond an upper bound of the work's duration, after which a worker counts as stuck,
     and is replaced; default 60.
     """
-    cluster: Annotated[
-        Literal["ray"] | Ray | None,
-        option(
-            "processes",
-        ),
-    ] = None
-    """``"ray"`` or :class:`batchpid.sim.Ray`: the workers run on the machines of a Ray cluster,
-    with bit-identical results (docs/reliability.md).
+    cluster: Annotated[Literal["ray"] | None, option("processes")] = None
+    """``"ray"``: the workers run on the machines of a Ray cluster, with bit-identical results
+    (docs/reliability.md).
     """
 
     def fit(self, robot: Robot) -> Self:
@@ -587,13 +526,10 @@ class WorkerOptions(OptionGroup):
             return self.changed(
                 workers=len(os.sched_getaffinity(0)) if workers is None else workers
             )
-        if self.cluster == "ray":
-            cluster = Ray()
-        else:
-            cluster = self.cluster
         # Each machine of a cluster has its own number of workers.
         if self.workers is not None:
-            problem = "is not for a cluster"
-            remedy = "pass cluster=Ray(cpus_per_node=...)"
-            raise InvalidArgumentError("workers", problem, value=self.workers, remedy=remedy)
-        return self.changed(cluster=instance("cluster", cluster, Ray, "pass 'ray' or Ray(...)"))
+            problem = "is not for a cluster, whose machines have a worker for each CPU"
+            raise InvalidArgumentError(
+                "workers", problem, value=self.workers, remedy="leave it out"
+            )
+        return self

@@ -13,9 +13,6 @@ from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Annotated, Any, Concatenate, ParamSpec, get_type_hints
 
-import numpy as np
-from numpy.typing import NDArray
-
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Kind, PerMassMatrix
 from batchpid.arrays.field_tables import Field, declared, plain
@@ -25,16 +22,14 @@ from batchpid.checks import AxisKind, instance
 from batchpid.errors import InvalidArgumentError, RobotError
 from batchpid.law.computed_torque import check_gain_units
 from batchpid.law.state import check_drive
-from batchpid.motors.friction import Friction
 from batchpid.sim.description.tables import MjcfFile
-from batchpid.sim.engine.scene_spec import SceneSpec, added_friction
+from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.options.groups import (
     Controller,
     ControlMode,
     ControlOptions,
     Option,
     Place,
-    Ray,
     SceneOptions,
     WorkerOptions,
     option,
@@ -127,9 +122,7 @@ class RunnerOptions(RunnerKeywords):
     ground: bool
     contacts: tuple[str, ...] | None
     wrenches: tuple[str, ...] | None
-    speed_limit: NDArray[np.float64] | None
     guard: bp.Guard | None
-    cluster: Ray | None
     actuators: bp.Actuators | None
 
     def __post_init__(self) -> None:
@@ -223,12 +216,6 @@ class RunnerOptions(RunnerKeywords):
         """Last axis of each array of a command: the kind of its columns, and their names."""
         kind: AxisKind = "joint" if self.own_command is None else "entry"
         return (*[(kind, self.command.names)] * 3, ("joint", self.robot.joint_names))
-
-    def has_stiction(self, actuators: bp.Actuators | None) -> bool:
-        """Return whether joints with ``actuators`` have Coulomb friction that the loop models."""
-        if self.robot.friction.any() or getattr(self.randomization, "friction", None) is not None:
-            return True
-        return added_friction(Friction(), actuators).coulomb is not None
 
     def check_params(self, params: bp.PIDParams) -> bp.PIDParams:
         """Return ``params``, as a read-only copy, if they fit the robot, the number of envs and the

@@ -329,7 +329,7 @@ def _substeps(
             if len(time) > 1 and period > 0:
                 # Times are rounded: over all rows the period is closer than between two.
                 period = (time[-1] - time[0]) / np.round(np.diff(time) / period).sum()
-            remedy += f", or use --timestep {period / substeps:.9g} (timestep=), or --by-plan"
+            remedy += f", or use --timestep {period / substeps:.9g} (timestep=)"
         raise error(source, problem, remedy)
     if first + len(time) == 1:
         problem = f"line {lines[0]}: the only row is at 0 s"

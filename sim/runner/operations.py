@@ -15,19 +15,16 @@ from numpy.typing import ArrayLike
 
 import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64, Rows
-from batchpid.arrays.trees import flatten
 from batchpid.checks import env_mask
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.loop.arrays import Arrays, Snapshot
 from batchpid.sim.loop.faults import CAUSES, COMMAND_CAUSES, MOST_EVENTS, NO_STEP, Fault
-from batchpid.sim.loop.group_control import empty_control
 from batchpid.sim.options.options import IDEAL, RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
 from batchpid.sim.rollout import ACTUATORS, PARAMS, RESET, RESTORE
 from batchpid.sim.runner.arguments import base_rows, joint_rows
 from batchpid.sim.workers.pool import Outcome
 from batchpid.sim.workers.requests import Request
-from batchpid.stages.stage import by_name
 from batchpid.stages.values import Command
 
 READ = Request("read", changes_loop=False)
@@ -249,24 +246,14 @@ def snapshot_of(options: RunnerOptions, state: RunnerState, rows: dict[str, Rows
 def restored(options: RunnerOptions, snapshot: Snapshot, present: Snapshot) -> Request:
     """Return the request that restores a snapshot, checked and copied.
 
-    ``present`` is any snapshot of this runner; only the shapes of its ``control/`` arrays may
-    differ, since params and actuators decide them.
+    ``present`` is any snapshot of this runner.
     """
-    num_envs = options.num_envs
-    randomization = options.randomization
     params = options.check_params(snapshot.params)
-    acting = actuators = options.check_actuators(
-        IDEAL if snapshot.actuators is None else snapshot.actuators
-    )
+    actuators = options.check_actuators(IDEAL if snapshot.actuators is None else snapshot.actuators)
     draws = NOTHING
-    if randomization is not None:
-        # Delays of drawn actuators say how long the histories are.
-        draws = randomization.draw(options.robot, snapshot.episodes(num_envs))
-        acting = randomization.randomized("actuators", actuators, draws, options.robot)
-    stages, states, _ = empty_control(options, params, acting)
-    control = by_name(stages, states)
-    rows = {name: table for name, table in present.rows.items() if "control/" not in name}
-    snapshot.check_rows(rows | flatten({"control": control}))
+    if options.randomization is not None:
+        draws = options.randomization.draw(options.robot, snapshot.rows["episodes"])
+    snapshot.check_rows(present.rows)
     return restore_request(replace(snapshot.copy(), params=params, actuators=actuators), draws)
 
 

@@ -99,9 +99,9 @@ class Runner(SingleOwner):
     workers, first_env, timeout, cluster, backend
         Processes that step the scenes, default one per core, 0 for this process; number of the
         first env; time after which a worker counts as stuck [s]; machines; "numpy" or "jax".
-    on_fault, on_invalid_input, speed_limit
+    on_fault, on_invalid_input
         Failed envs "hold" or "reset"; inputs that are not finite "raise", or are contained by
-        failures ("contain"); joint speed at which an env fails.
+        failures ("contain").
 
     Raises
     ------

@@ -1,44 +1,52 @@
-"""Pictures and films of robots, drawn by Matplotlib: as shaded triangles, the farthest from the
-camera first.
-"""
+"""Pictures and films of robots, drawn by Matplotlib as shaded triangles."""
 
 from __future__ import annotations
 
 import math
-import subprocess
-import tempfile
-from collections.abc import Iterable, Iterator
-from contextlib import suppress
+from operator import itemgetter
 from pathlib import Path
-from typing import IO, Any, cast
+from subprocess import CalledProcessError
+from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import RendererAgg
-from matplotlib.transforms import Bbox, IdentityTransform
+from matplotlib import rc_context
+from matplotlib.animation import FFMpegWriter
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LightSource
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d import Axes3D
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64, Progress, Rows
 from batchpid.checks import file_path
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
-from batchpid.io.files import replacing
+from batchpid.io.files import imported, replacing
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.rollout import Rollout
-from batchpid.sim.view.scene import FIELD_OF_VIEW, TILE, RobotScene, Surface
+from batchpid.sim.view.scene import TILE, RobotScene, Surface
 from batchpid.sim.view.view_data import Playback, rows_at
 from batchpid.task_space.frames import matrix_of, rotate
 
-LIGHT = np.array([0.5, 0.2, 0.84])
-"""Direction to the light."""
+LIGHT = LightSource(azdeg=68, altdeg=57)
 _TILES = np.array([[0.74, 0.78, 0.83], [0.79, 0.82, 0.87]])
 """Colours of the tiles of the floor, like a chess board's."""
-_NEAREST = 0.05
-"""Distance from the camera below which nothing is drawn [m]."""
-_FARTHEST_POINT = 100.0
-"""Distance from the middle of a picture beyond which nothing is drawn, in half heights."""
+_TILE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+"""Corners of a tile."""
 _CELL = 1.5
 """Edge of the cubes that keep one vertex of a mesh [pixels]."""
 _NEARER = 0.85
 """Distance of the camera, as a share of that on the page, whose sides are covered by panels."""
+_FOCAL_LENGTH = 0.12
+"""Focal length of Matplotlib's camera."""
+_HALF_BOX = 0.46
+"""Half the edge of the box that the axes show, over the distance of a camera of that focal length
+from its middle.
+"""
+_DPI = 100.0
+"""Pixels of a picture to an inch of Matplotlib's."""
+_NEAREST = 0.05
+"""Distance from the camera below which nothing is drawn [m]."""
 
 
 class Painter:
@@ -52,109 +60,93 @@ class Painter:
         size: tuple[int, int],
     ) -> None:
         self._scene = scene = RobotScene(robot, count, ground, segments=12)
-        self._size = size
-        self._eye = scene.target + _NEARER * (scene.eye - scene.target)
-        distance = float(np.linalg.norm(scene.target - self._eye))
-        forward = (scene.target - self._eye) / distance
-        right = np.cross(forward, [0.0, 0.0, 1.0]) / np.linalg.norm(forward[:2])
-        self._axes = np.stack([right, np.cross(right, forward), forward])  # right, up, forward
-        pixel = 2 * math.tan(FIELD_OF_VIEW / 2) * distance / size[1]
-        self._surfaces = [coarse(surface, _CELL * pixel) for surface in scene.surfaces]
+        view = _NEARER * (scene.eye - scene.target)
+        self._distance = float(np.linalg.norm(view))
+        self._direction = view / self._distance
+        half = _HALF_BOX * self._distance
+        x, y, z = self._direction.tolist()
+        # The axes are square, as wide as the picture.
+        width, height = size
+        self.figure = Figure((width / _DPI, height / _DPI), _DPI)
+        self._canvas = FigureCanvasAgg(self.figure)
+        square = (0, (1 - width / height) / 2, 1, width / height)
+        self._axes = Axes3D(self.figure, square, computed_zorder=False)
+        self.figure.add_axes(self._axes)
+        self._axes.set_axis_off()
+        self._axes.set_proj_type("persp", _FOCAL_LENGTH)
+        self._axes.view_init(math.degrees(math.asin(z)), math.degrees(math.atan2(y, x)))
+        box = np.stack([scene.target - half, scene.target + half], axis=1)
+        self._axes.set(xlim=box[0], ylim=box[1], zlim=box[2], box_aspect=(1, 1, 1))
+        self._draw_floor()
+        self._surfaces = [coarse(surface, _CELL * 2 * half / width) for surface in scene.surfaces]
         counts = [len(surface.faces) for surface in self._surfaces]
         colours = np.repeat([surface.rgba[:3] for surface in self._surfaces], counts, axis=0)
         self._colours = np.tile(colours, (count, 1))
-        self._renderer: Any = RendererAgg(*size, 100)
-        self._draw(*self._floor())
-        self._background = self._renderer.copy_from_bbox(Bbox.from_bounds(0, 0, *size))
+        self._robots: Any = None
+
+    def show(self, qpos: Rows, base_pose: Rows | None = None) -> None:
+        """Draw robots into :attr:`figure`, in poses as for :meth:`RobotScene.place`."""
+        if self._robots is not None:
+            self._robots.remove()
+        poses = self._scene.place(qpos, base_pose)
+        parts = []
+        for surface, pose in zip(self._surfaces, poses.swapaxes(0, 1), strict=True):
+            vertices = rotate(matrix_of(pose[:, None, 3:]), surface.vertices) + pose[:, None, :3]
+            parts.append(vertices[:, surface.faces])
+        corners = np.concatenate(parts, axis=1).reshape(-1, 3, 3)
+        self._robots = self._draw(corners, self._colours)
 
     def picture(self, qpos: Rows, base_pose: Rows | None = None) -> NDArray[np.uint8]:
-        """Return the picture (height, width, 3) in RGB of robots in poses as for
-        :meth:`RobotScene.place`.
-        """
-        self._renderer.restore_region(self._background)
-        self._draw(self._corners(self._scene.place(qpos, base_pose)), self._colours)
-        return np.asarray(self._renderer.buffer_rgba())[..., :3].copy()
+        """Return the picture (height, width, 3) in RGB of robots in poses as for :meth:`show`."""
+        self.show(qpos, base_pose)
+        self._canvas.draw()
+        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
-    def _draw(self, corners: Float64, colours: Float64) -> None:
-        """Draw triangles, ``corners`` (triangles, 3, 3) [m] and ``colours`` (triangles, 3), over the
-        picture.
-        """
-        seen = (corners - self._eye) @ self._axes.T
-        depth = seen[..., 2]
-        scale = math.tan(FIELD_OF_VIEW / 2) * np.maximum(depth, _NEAREST)
-        # Places in a picture whose upper edge is at 1.
-        places = seen[..., :2] / scale[..., None]
-        # A triangle far outside the picture, or of a pose that is not a number, is not drawn.
-        near = (np.abs(places) < _FARTHEST_POINT).all(axis=(1, 2))
-        visible = np.flatnonzero(near & (depth > _NEAREST).all(axis=1))
-        order = visible[np.argsort(-depth[visible].mean(axis=1))]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        brightness = 0.55 + 0.45 * np.clip(normals @ LIGHT, 0, 1)
-        # One colour at the three corners of a triangle.
-        shades = np.ones((len(order), 3, 4))
-        shades[..., :3] = np.clip(colours * brightness[:, None], 0, 1)[order, None]
-        width, height = self._size
-        points = places[order] * height / 2 + [width / 2, height / 2]
-        context = self._renderer.new_gc()
-        self._renderer.draw_gouraud_triangles(context, points, shades, IdentityTransform())
-
-    def _floor(self) -> tuple[Float64, Float64]:
-        """Return corners and colours of the floor's triangles: without a ground, of every second
-        tile.
-        """
+    def _draw_floor(self) -> None:
+        """Draw the tiles of the floor: without a ground, every second one."""
         scene = self._scene
         counts = np.rint(2 * scene.half_floor / TILE).astype(int)
         tiles = np.argwhere(np.ones(counts.tolist()))
         if not scene.ground:
             tiles = tiles[tiles.sum(1) % 2 == 0]
         places = np.insert(TILE * tiles - scene.half_floor, 2, scene.floor, axis=1)
-        halves = np.array([[[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[1, 1, 0], [0, 1, 0], [0, 0, 0]]])
-        corners = (places[:, None, None] + TILE * halves).reshape(-1, 3, 3)
-        return corners, _TILES[tiles.sum(1) % 2].repeat(2, axis=0)
+        self._draw(places[:, None] + TILE * _TILE, _TILES[tiles.sum(1) % 2])
 
-    def _corners(self, poses: Float64) -> Float64:
-        """Return the corners (triangles, 3, 3) [m] of all robots for the ``poses`` of their
-        surfaces.
+    def _draw(self, corners: Float64, colours: Float64) -> Any:
+        """Draw polygons, ``corners`` (polygons, corners, 3) [m] and ``colours`` (polygons, 3), in
+        front of those before, and return them.
         """
-        parts = []
-        for surface, pose in zip(self._surfaces, poses.swapaxes(0, 1), strict=True):
-            vertices = rotate(matrix_of(pose[:, None, 3:]), surface.vertices) + pose[:, None, :3]
-            parts.append(vertices[:, surface.faces])
-        return np.concatenate(parts, axis=1).reshape(-1, 3, 3)
+        depth = self._distance - (corners - self._scene.target) @ self._direction
+        # Matplotlib would draw what is behind the camera upside down.
+        seen = (depth > _NEAREST).all(axis=1)
+        polygons = Poly3DCollection(
+            corners[seen],
+            facecolors=colours[seen],
+            shade=True,
+            lightsource=LIGHT,
+            antialiased=False,
+        )
+        return self._axes.add_collection3d(polygons)
 
 
 def coarse(surface: Surface, cell: float) -> Surface:
     """Return a surface with one vertex in each cube of edge ``cell`` [m], and the triangles that
-    remain.
-
-    Published meshes have a hundred times as many triangles as a film can show. (Vertex clustering:
-    J. Rossignac and P. Borrel, Multi-resolution 3D approximations for rendering complex scenes,
-    1993.)
+    remain: published meshes have a hundred times as many as a film can show.
     """
-    cubes = np.round((surface.vertices - surface.vertices.min(0)) / cell).astype(np.int64)
-    sizes = cubes.max(0) + 1
-    number = (cubes[:, 0] * sizes[1] + cubes[:, 1]) * sizes[2] + cubes[:, 2]
-    _, first, place = np.unique(number, return_index=True, return_inverse=True)
-    faces = place[surface.faces]
-    a, b, c = faces.T
-    faces = faces[(a != b) & (b != c) & (c != a)]
-    # Triangles of the same corners are drawn once.
-    _, distinct = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    return surface._replace(vertices=surface.vertices[first], faces=faces[np.sort(distinct)])
+    mesh = imported("trimesh").Trimesh(surface.vertices / cell, surface.faces, process=False)
+    mesh.merge_vertices(digits_vertex=0)
+    mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
+    return surface._replace(vertices=cell * mesh.vertices, faces=mesh.faces)
 
 
 SIZE = (960, 540)
 """Width and height of a film [pixels]; the formats need even ones."""
-FPS = 30.0
+FPS = 30
 """Frames of a film per second."""
 MOST_FRAMES = 100_000
 """Largest number of frames of a film, nearly an hour."""
-ENCODERS = {
-    ".mp4": "-pix_fmt yuv420p",
-    ".gif": "-vf split[a][b];[a]palettegen[p];[b][p]paletteuse -loop 0",
-}
-"""Options of ffmpeg for each format."""
+CODECS = {".mp4": "h264", ".gif": "gif"}
+"""Codec of each format."""
 
 
 def write_film(
@@ -184,7 +176,7 @@ def write_film(
     BatchPIDError
         ffmpeg failed.
     """
-    path = file_path("out", out, ENCODERS)
+    path = file_path("out", out, CODECS)
     try:
         from imageio_ffmpeg import get_ffmpeg_exe
     except ImportError:
@@ -197,47 +189,21 @@ def write_film(
         raise InvalidArgumentError("rollout", problem, remedy=remedy)
     times = np.arange(0.0, recorded.duration + 0.5 / FPS, 1 / FPS)
     rows = rows_at(rollout, times).tolist()
-
-    def pictures() -> Iterator[NDArray[np.uint8]]:
-        for row in rows if progress is None else progress(rows):
-            base = None
-            if rollout.base_pose is not None:
-                base = rollout.base_pose[row]
-            yield painter.picture(rollout.qpos[row], base)
-
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary:
-        encode(pictures(), temporary, get_ffmpeg_exe())
+    writer = FFMpegWriter(FPS, CODECS[path.suffix.lower()])
+    try:
+        with (
+            replacing(path) as temporary,
+            rc_context({"animation.ffmpeg_path": get_ffmpeg_exe()}),
+            writer.saving(painter.figure, str(temporary), _DPI),
+        ):
+            for row in rows if progress is None else progress(rows):
+                seen = rollout.observation.map(itemgetter(row))
+                painter.show(seen.qpos, seen.base_pose)
+                writer.grab_frame()
+    except CalledProcessError as error:
+        # Ctrl-C ends ffmpeg, too.
+        if isinstance(error.__context__, KeyboardInterrupt):
+            raise error.__context__ from None
+        raise BatchPIDError(f"{path}: ffmpeg: {error.stderr.strip()}") from error
     return path
-
-
-def encode(
-    pictures: Iterable[NDArray[np.uint8]],
-    path: Path,
-    ffmpeg: str,
-) -> None:
-    """Write RGB ``pictures`` (height, width, 3) of :data:`SIZE` to a film, by the program
-    ``ffmpeg``.
-    """
-    source = "-v error -f rawvideo -pix_fmt rgb24 -s {}x{} -r {} -i -".format(*SIZE, FPS)
-    options = ENCODERS[path.suffix.lower()]
-    command = [ffmpeg, *source.split(), *options.split(), "-y", f"file:{path}"]
-    with tempfile.TemporaryFile() as messages:
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=messages,
-        )
-        try:
-            # The pipe breaks where ffmpeg has ended, with a message.
-            with suppress(BrokenPipeError), cast("IO[bytes]", process.stdin) as pipe:
-                for picture in pictures:
-                    pipe.write(picture.tobytes())
-        finally:
-            # Its input is closed, so ffmpeg ends, also after Ctrl-C.
-            status = process.wait()
-        if status:
-            messages.seek(0)
-            text = messages.read().decode(errors="replace").strip()
-            raise BatchPIDError(f"{path}: ffmpeg: {text}")

@@ -1,28 +1,32 @@
-"""Page that shows robots: their scene, a chart of a joint, controls, the loop that keeps real time,
-and the gate that only the owner of its address passes.
+"""Page that shows robots: their scene, controls, the chart of a joint, the loop that keeps real
+time, and the gate that only the owner of its address passes.
 """
 
 from __future__ import annotations
 
 import errno
 import io
+import math
 import re
 import secrets
 import socket
 import time
+from collections import deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager, redirect_stdout
 from functools import partial
 from http import HTTPStatus
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from batchpid.arrays.array_types import Rows
 from batchpid.errors import BatchPIDError, MissingDependencyError
 from batchpid.io.files import uninterrupted
 from batchpid.sim.findings import summary
 from batchpid.sim.view.scene import FIELD_OF_VIEW, TILE, RobotScene
-from batchpid.sim.view.view_data import HISTORY_SECONDS, Panel, ViewData
+from batchpid.sim.view.view_data import LiveSimulation, ViewData
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -31,17 +35,14 @@ HOST = "127.0.0.1"
 """Address of the server: only this machine reaches it."""
 CHART_FRAMES = 5
 """Frames between two updates of chart and status."""
-CURVE = {"label": "qpos", "stroke": "#15803d", "width": 2}
-SETPOINT_CURVE = {
-    "label": "setpoint",
-    "stroke": "#4a82ff",
-    "width": 1,
-    "dash": [6, 4],
-}
-SCALES = {
-    # Without a fixed range the axis drifts in viser 1.1.
-    "x": {"time": False, "range": (-HISTORY_SECONDS, 0.0)},
-}
+PAST_FRAMES = 240
+"""Longest past that the chart shows."""
+SERIES = (
+    {"label": "s"},
+    {"label": "qpos", "stroke": "#15803d", "width": 2},
+    {"label": "setpoint", "stroke": "#4a82ff", "width": 1},
+)
+"""Time, and the curves of the chart."""
 
 
 class View(AbstractContextManager["View"]):
@@ -79,30 +80,11 @@ class View(AbstractContextManager["View"]):
         with redirect_stdout(io.StringIO()):  # viser's banner
             self._server = gate.start(make)
 
-        # Controls on the right, a chart on the left, the scene between them.
-        gui: Any = self._server.gui
-        gui.configure_theme(
-            show_logo=False,
-            show_share_button=False,
-            brand_color=(43, 92, 199),
-        )
-        self.panel = Panel(gui, data)
-        gui.main_panel.dock_right()
-        gui.main_panel.set_width(330)
-        left = gui.add_panel()
-        with left.add_tab("Chart"):
-            flat = (np.array([-HISTORY_SECONDS, 0.0]), np.zeros(2), np.zeros(2))
-            self._chart = gui.add_uplot(
-                flat,
-                ({"label": "s"}, CURVE, SETPOINT_CURVE),
-                scales=SCALES,
-                legend={"show": True, "live": False},
-                height=220,
-                axes=({"size": 30, "stroke": "#6b7280"}, {"size": 56, "stroke": "#6b7280"}),
-                padding=(4, 14, 0, 0),
-            )
-        left.dock_left()
-        left.set_width(380)
+        self.running = True
+        """Whether frames follow each other, or the page is paused."""
+        # viser calls back from another thread.
+        self._requests: SimpleQueue[Callable[[], object]] = SimpleQueue()
+        self._add_controls()
         # A browser without a GPU transforms every vertex in software.
         segments = 24 if data.num_envs < 9 else 12
         self._scene = RobotScene(data.robot, data.num_envs, data.ground, segments)
@@ -113,24 +95,24 @@ class View(AbstractContextManager["View"]):
     def run(self, seconds: float | None = None) -> None:
         """Serve the page for ``seconds`` of wall time, or until :meth:`stop` or Ctrl-C."""
         data = self.data
-        panel = self.panel
         began = deadline = time.monotonic()
         count = 0
         self._show_robots()
         while not self._stopped and (seconds is None or time.monotonic() - began < seconds):
-            requested = panel.run_requests()
-            if panel.running:
+            requested = self._requests.qsize()
+            for _ in range(requested):
+                self._requests.get()()
+            if self.running:
                 data.advance()
-            if requested or panel.running:
+            if requested or self.running:
                 self._show_robots()
-            now = time.monotonic()
+            self._past.append(np.stack([data.observation.qpos[0], data.setpoint[0]]))
             count += 1
-            # Also while the page is paused, where another joint may be chosen.
             if count % CHART_FRAMES == 0:
                 self._draw_chart()
-                panel.update_status(data.frame())
             # A late frame is not caught up, which would only hurry the next ones.
-            deadline = max(deadline + data.period / panel.speed, now)
+            now = time.monotonic()
+            deadline = max(deadline + data.period / self._speed.value, now)
             time.sleep(deadline - now)
 
     def stop(self) -> None:
@@ -149,13 +131,64 @@ class View(AbstractContextManager["View"]):
 
     def _show_robots(self) -> None:
         """Send the poses of the present frame to the pages."""
-        frame = self.data.frame()
-        base = None if frame.base_pose is None else frame.base_pose[0]
-        poses = self._scene.place(frame.qpos[0], base).astype(np.float32).swapaxes(0, 1)
+        seen = self.data.observation
+        poses = self._scene.place(seen.qpos, seen.base_pose).astype(np.float32).swapaxes(0, 1)
         with self._server.atomic():
             for node, pose in zip(self._nodes, poses, strict=True):
                 node.batched_positions = np.ascontiguousarray(pose[:, :3])
                 node.batched_wxyzs = np.ascontiguousarray(pose[:, 3:])
+
+    def _draw_chart(self) -> None:
+        """Draw the recent past of the chosen joint of the first robot, and update the status."""
+        data = self.data
+        diverged = int((~data.observation.ok).sum())
+        self._status.content = f"t = {data.time:.2f} s, {diverged} diverged"
+        joint = data.robot.joint_names.index(self._joint.value)
+        # Smaller differences make a flat line jitter, and a number that is not finite would empty
+        # the chart.
+        rows = np.nan_to_num(np.round(np.array(self._past)[..., joint], 4))
+        past = data.period * np.arange(1.0 - len(rows), 1.0)
+        self._chart.data = (past, *rows.T)
+
+    def _add_controls(self) -> None:
+        """Add buttons for the motion, the chart, and a slider for the setpoint of each joint."""
+        gui: Any = self._server.gui
+        gui.configure_theme(show_logo=False, show_share_button=False)
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(330)
+        self._status = gui.add_markdown("")
+        motion = gui.add_button_group("Motion", ("Run", "Pause", "Reset"))
+        motion.on_click(partial(self._request, self._control))
+        self._speed = gui.add_slider("Speed", 0.1, 2.0, 0.1, 1.0)
+        data = self.data
+        self._past: deque[Rows] = deque(maxlen=PAST_FRAMES)
+        self._joint = gui.add_dropdown("Joint", data.robot.joint_names)
+        # Without a fixed range the axis drifts in viser 1.1.
+        scales = {"x": {"time": False, "range": (-PAST_FRAMES * data.period, 0.0)}}
+        self._chart = gui.add_uplot((np.zeros(2),) * 3, SERIES, scales=scales, height=200)
+        if not isinstance(data, LiveSimulation):
+            return
+        # Followers move with their leaders.
+        for index in np.flatnonzero(data.robot.independent).tolist():
+            joint = data.robot.joints[index]
+            # Fewer digits to read, inside the limits.
+            low = math.ceil(1e3 * max(joint.lower, -2 * math.pi)) / 1e3
+            high = math.floor(1e3 * min(joint.upper, 2 * math.pi)) / 1e3
+            value = float(np.clip(data.setpoint[0, index], low, high))
+            slider = gui.add_slider(f"{joint.name} [{joint.unit}]", low, high, 1e-3, value)
+            slider.on_update(partial(self._request, partial(data.set_setpoint, joint=index)))
+
+    # A coroutine, so that the changes stay in order.
+    async def _request(self, action: Callable[[Any], object], event: Any) -> None:
+        """Request ``action(value)`` with the value that a page gave a control."""
+        self._requests.put(partial(action, event.target.value))
+
+    def _control(self, button: str) -> None:
+        """Carry out a button of the motion."""
+        if button == "Reset":
+            self.data.reset()
+        else:
+            self.running = button == "Run"
 
     def _add_robots(self) -> list[Any]:
         """Add the scene to the page; return a node for each surface, which is placed once for each
@@ -199,24 +232,6 @@ class View(AbstractContextManager["View"]):
         camera.look_at = tuple(scene.target)
         camera.fov = FIELD_OF_VIEW
         return nodes
-
-    def _draw_chart(self) -> None:
-        """Draw the recent past of the watched joint: position and setpoint."""
-        history = self.data.history()
-        past = history.time - history.time[-1]
-        # One row makes no curve.
-        if len(past) < 2:
-            return
-        place = (slice(None), self.panel.env, self.panel.joint)
-        joint = self.data.robot.joints[self.panel.joint]
-        curves = [history.qpos[place]] * 2
-        if history.info.sets_positions:
-            curves[1] = history.setpoint[place]
-        self._chart.title = f"{joint.name} [{joint.unit}]"
-        # Smaller differences make a flat line jitter, and a number that is not finite would empty
-        # the chart.
-        rounded = [np.nan_to_num(np.round(curve, 4).astype(np.float64)) for curve in curves]
-        self._chart.data = (past, *rounded)
 
 
 class Gate:

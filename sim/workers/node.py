@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.loop import Failure, failed
-from batchpid.sim.options.groups import Ray
 from batchpid.sim.workers.requests import Request, SharedArrays, Start, split
 from batchpid.sim.workers.worker import Worker, WorkerLost, pickled
 
@@ -98,50 +97,44 @@ class Cluster:
     Raises
     ------
     InvalidArgumentError
-        The cluster has no machine with enough CPUs.
+        The cluster has no machine with a CPU.
     MissingDependencyError
         The package ``ray`` is missing.
     """
 
-    def __init__(self, options: Ray, num_envs: int) -> None:
-        self.ray: Any = _connect(options)
+    def __init__(self, num_envs: int) -> None:
+        self.ray: Any = _connected()
         """The module."""
-        self.options = options
-        least = options.cpus_per_node or 1
-        counts = [node["Resources"].get("CPU", 0) for node in self.ray.nodes() if node["Alive"]]
+        resources = [node["Resources"] for node in self.ray.nodes() if node["Alive"]]
+        cpus = sorted([int(each.get("CPU", 0)) for each in resources], reverse=True)[:num_envs]
+
+        def workers(machines: int) -> int:
+            return machines * cpus[machines - 1]
+
         # The largest machines, each with as many workers as the smallest of them has CPUs: as many
         # machines as give the most workers in all.
-        large = sorted([int(count) for count in counts if count >= least], reverse=True)
-        most = min(len(large), options.nodes or num_envs, num_envs)
-        parts = (large[:count] for count in range(most, 0, -1))
-        fixed = options.cpus_per_node
-        used = max(
-            parts,
-            key=lambda part: len(part) * (fixed or part[-1]),
-            default=[],
-        )
-        if not used:
-            remedy = "lower cpus_per_node, or add larger machines"
-            raise InvalidArgumentError("cluster", f"has no machine of {least} CPUs", remedy=remedy)
-        self.workers: int = fixed or used[-1]
+        count = max(range(1, len(cpus) + 1), key=workers, default=0)
+        self.workers: int = cpus[count - 1] if count else 0
         """Workers on each machine."""
-        self.slices = split(num_envs, len(used))
+        if not self.workers:
+            remedy = "add a machine, or start Ray on one with CPUs"
+            raise InvalidArgumentError("cluster", "has no machine with a CPU", remedy=remedy)
+        self.slices = split(num_envs, count)
         """Envs of each node."""
 
 
-def _connect(options: Ray) -> Any:
-    """Return the module ray, connected to the cluster."""
+def _connected() -> Any:
+    """Return the module ray, connected to the cluster: by the caller, or by Ray's own rules."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # without it, a warning
     try:
         import ray
     except ImportError:
         raise MissingDependencyError("ray", "cluster='ray'", "ray") from None
-    if ray.is_initialized():
-        return ray
-    logging.getLogger("ray").setLevel(logging.ERROR)
-    # Without an address Ray takes RAY_ADDRESS, or a cluster that runs here, or starts one.
-    ray.init(options.address, log_to_driver=False, configure_logging=False)
+    if not ray.is_initialized():
+        logging.getLogger("ray").setLevel(logging.ERROR)
+        # Ray takes RAY_ADDRESS, or a cluster that runs here, or starts one.
+        ray.init(log_to_driver=False, configure_logging=False)
     return ray
 
 
@@ -168,7 +161,6 @@ class NodeWorker(Worker):
         actor_type = self._cluster.ray.remote(Node).options(
             num_cpus=self._cpus,
             scheduling_strategy="SPREAD",
-            runtime_env=self._cluster.options.runtime_env,
         )
         self._actor = actor_type.remote()
         # A node that replaces a lost one reserves no CPUs, which the lost one has until it has ended.

@@ -159,7 +159,7 @@ class WorkerPool(SingleOwner):
         self.warnings: list[str] = []
         """Messages about replaced workers, for warnings."""
         if options.cluster is not None:
-            cluster = Cluster(options.cluster, num_envs)
+            cluster = Cluster(num_envs)
             slices = cluster.slices
             loops = min(num_envs, len(slices) * cluster.workers)
             most_steps = NODE_STEPS

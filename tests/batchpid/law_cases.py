@@ -39,19 +39,7 @@ OPTIONS = {
     "back calculation": (
         LIMITED | {"anti_windup": "back_calculation", "tracking_time": [0.1, 0.001, 0.0]}
     ),
-    "mixed": LIMITED | {"anti_windup": ["back_calculation", "conditional", "clamp"]},
-    "mixed per env": (
-        LIMITED
-        | {
-            "anti_windup": [
-                ["none", "conditional", "clamp"],
-                *[["back_calculation", "conditional", "none"]] * (ENVS - 1),
-            ]
-        }
-    ),
     "continuous": GAINS | {"continuous": [True, False, True]},
-    "zero effort": LIMITED | {"non_finite": "zero"},
-    "hold effort": LIMITED | {"non_finite": "hold"},
     "everything": (
         LIMITED
         | {
@@ -61,9 +49,8 @@ OPTIONS = {
             "setpoint_weight": 0.7,
             "setpoint_weight_derivative": 0.2,
             "deadband": 0.05,
-            "anti_windup": ["back_calculation", "conditional", "clamp"],
+            "anti_windup": "back_calculation",
             "continuous": [True, False, True],
-            "non_finite": "hold",
         }
     ),
 }
@@ -84,7 +71,7 @@ NUMBERS = {
 """Options that are numbers: the value that is off, and one that has an effect."""
 DRIVE_LACKS = (
     *("effort_rate_limit", "derivative_filter_time", "setpoint_weight"),
-    *("setpoint_weight_derivative", "deadband", "non_finite"),
+    *("setpoint_weight_derivative", "deadband"),
 )
 """Options of the law that a drive does not have."""
 
@@ -104,11 +91,11 @@ def generated_options(seed, envs=ENVS, joints=JOINTS, units="effort"):
     if np.isfinite(options.get("effort_max", np.inf)).any():
         strategies.append("clamp")
     if units == "effort":
-        options["non_finite"] = rng.choice(["propagate", "zero", "hold"]).item()
         strategies.append("back_calculation")
-    options["anti_windup"] = rng.choice(strategies, shape).tolist()
-    if "back_calculation" in np.ravel(options["anti_windup"]):
-        options["tracking_time"] = rng.uniform(0.001, 0.3, shape)
+    options["anti_windup"] = rng.choice(strategies).item()
+    if options["anti_windup"] == "back_calculation":
+        time = rng.uniform(0.001, 0.3, shape)
+        options["tracking_time"] = np.where(rng.random(shape) < 0.3, math.inf, time)
     options["continuous"] = rng.random(shape) < 0.5
     if units == "implicit":
         options.pop("derivative_filter_time", None)

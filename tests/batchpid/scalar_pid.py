@@ -33,7 +33,6 @@ class ScalarPID:
     anti_windup: str = "none"
     tracking_time: float = math.inf
     continuous: bool = False
-    non_finite: str = "propagate"
     discretization: str = "explicit"
 
     def start(self, measurement, integral=0.0):
@@ -45,10 +44,6 @@ class ScalarPID:
 
     def step(self, setpoint, measurement, dt, **optional):
         """Return the effort after ``dt`` more seconds."""
-        if self.non_finite != "propagate" and not all(
-            map(math.isfinite, (setpoint, measurement, *optional.values()))
-        ):
-            return self.effort if self.non_finite == "hold" else 0.0
         total = self.total(setpoint, measurement, dt, **optional)
         change = self.effort_rate_limit * dt
         effort = within(total, self.effort - change, self.effort + change)

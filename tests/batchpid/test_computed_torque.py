@@ -9,11 +9,7 @@ from hypothesis import strategies as st
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.law import (
-    advance_with_mass_matrix,
-    check_gain_units,
-    convert_integral,
-)
+from batchpid.law import advance_with_mass_matrix, check_gain_units
 
 DT = 1e-3
 
@@ -66,30 +62,8 @@ def test_limits_keep_the_direction_of_the_acceleration_and_of_the_change_of_the_
     assert (np.isclose(step, 1).any(1) == late).all()
 
 
-def test_options_without_meaning_for_accelerations_are_refused():
-    for options in (
-        {"anti_windup": "back_calculation", "effort_limit": 1.0},
-        {"non_finite": "hold"},
-    ):
-        with pytest.raises(InvalidArgumentError, match="mass_matrix"):
-            check_gain_units(bp.make_params(1, 1.0, 1.0, 1.0, gain_units="mass_matrix", **options))
-        check_gain_units(bp.make_params(1, 1.0, 1.0, 1.0, **options))
-
-
-def test_a_change_of_gain_units_keeps_the_effort_of_the_integral_within_its_limits():
-    """Both ways, in the middle of a run; a change that keeps the integral's unit keeps the
-    state.
-    """
-    rng = np.random.default_rng(5)
-    matrix, y = mass(rng, 3, 4), rng.normal(size=(3, 4))
-    whole, other = params(4), params(4).replace(gain_units="effort")
-    state = bp.init(other, y)._replace(integral=rng.normal(size=(3, 4)))
-    there = convert_integral(state, other, whole, matrix)
-    _, terms = advance_with_mass_matrix(bp.discretise(whole, DT), there, y, y, matrix)
-    np.testing.assert_allclose(terms.i, state.integral)
-    back = convert_integral(there, whole, other, matrix)
-    np.testing.assert_allclose(back.integral, state.integral)
-    limited = convert_integral(there, whole, other.replace(integral_limit=0.5), matrix)
-    np.testing.assert_allclose(limited.integral, np.clip(state.integral, -0.5, 0.5))
-    assert convert_integral(state, other, other.replace(kp=1.0), matrix) is state
-    assert convert_integral(bp.PIDState(), other, whole, matrix) == bp.PIDState()
+def test_back_calculation_of_accelerations_is_refused():
+    options = {"anti_windup": "back_calculation", "effort_limit": 1.0}
+    with pytest.raises(InvalidArgumentError, match="mass_matrix"):
+        check_gain_units(bp.make_params(1, 1.0, 1.0, 1.0, gain_units="mass_matrix", **options))
+    check_gain_units(bp.make_params(1, 1.0, 1.0, 1.0, **options))

@@ -23,7 +23,7 @@ def test_jax_compiles_once_and_donates_the_state_but_no_input(inputs, x64, caplo
     pid(inputs.setpoint[0], y)
     with jax.log_compiles():
         for t in range(5):
-            before = pid.state
+            before = pid._state
             pid.params = PARAMS.replace(kp=float(t))
             pid(inputs.setpoint[t], y)
         first = [
@@ -44,7 +44,6 @@ ACTS = [
     lambda pid, y: setattr(pid, "params", PARAMS),  # options may be switched on in flight
     lambda pid, y: pid.reset(y[3], np.arange(ENVS) < 2),
     lambda pid, y: pid.reset(y[4], np.arange(ENVS) > 1),
-    lambda pid, y: pid.track(1.0, y[5], 0.5, y[6, :1]),
     lambda pid, y: setattr(pid, "params", PARAMS.replace(effort_rate_limit=300.0)),
     lambda pid, y: setattr(pid, "params", PARAMS.replace(anti_windup="conditional")),
     lambda pid, y: pid.reset(y[7]),
@@ -52,7 +51,7 @@ ACTS = [
 
 
 @pytest.mark.parametrize("backend", ["native", "jax"])
-def test_resets_tracking_and_other_params_give_the_efforts_of_numpy(backend, inputs, x64):
+def test_resets_and_other_params_give_the_efforts_of_numpy(backend, inputs, x64):
     with mock.patch.dict("os.environ", {"BATCHPID_NATIVE": "0"}):
         theirs = bp.BatchPID(bp.make_params(JOINTS, 1.0), ENVS, DT)
     kind = "jax" if backend == "jax" else "numpy"
@@ -70,16 +69,13 @@ def test_resets_tracking_and_other_params_give_the_efforts_of_numpy(backend, inp
                 assert (ours_leaf is None) == (leaf is None)
 
 
-def test_reset_and_track_are_those_of_the_law(inputs):
+def test_reset_is_that_of_the_law(inputs):
     pid, y = bp.BatchPID(PARAMS, ENVS, DT), inputs.measurement
     for t in range(6):
         pid(inputs.setpoint[t], y[t])
-    mask, forward = np.array([True, False, True, False]), {"feedforward": 0.2}
+    mask = np.array([True, False, True, False])
     expected = bp.reset(PARAMS, pid.state, y[9], mask)
     pid.reset(y[9], mask)
-    jax.tree.map(np.testing.assert_array_equal, pid.state, expected)
-    expected = bp.track(PARAMS, pid.state, 1.0, y[9], 0.5, dt=DT, **forward)
-    pid.track(1.0, y[9], 0.5, **forward)
     jax.tree.map(np.testing.assert_array_equal, pid.state, expected)
     kept = pid.state.integral
     pid.params = PARAMS.replace(effort_rate_limit=1e9, derivative_filter_time=None)
@@ -101,8 +97,6 @@ def test_params_of_another_size_or_type_are_refused_and_change_nothing():
     ):
         with pytest.raises(bp.InvalidArgumentError, match=f"^{argument}: "):
             pid.params = params
-    with pytest.raises(bp.InvalidArgumentError, match="terms: are off"):
-        _ = pid.terms
     assert pid.params is PARAMS
     assert all(
         a is b is None or np.array_equal(a, b) for a, b in zip(before, pid.state, strict=True)
@@ -113,9 +107,3 @@ def test_a_missing_jax_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "jax", None)
     with pytest.raises(bp.MissingDependencyError, match=r"\.\[jax\]"):
         bp.BatchPID(PARAMS, ENVS, DT, "jax")
-
-
-def test_jax_returns_terms_on_request():
-    pid = bp.BatchPID(bp.make_params(JOINTS, 3.0), ENVS, DT, "jax", terms=True)
-    pid(np.ones(JOINTS), np.zeros((ENVS, JOINTS)))
-    assert (np.asarray(pid.terms.p) == 3).all()

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import batchpid as bp
-from batchpid.arrays.array_types import CHOICE_TYPES, HoldEffort, ZeroEffort
+from batchpid.arrays.array_types import CHOICE_TYPES, Clamp, Conditional
 from batchpid.arrays.trees import digest
 
 
@@ -88,11 +88,11 @@ def test_choices_equal_those_of_their_type_alone():
     """Empty tuples are equal to each other: a cache would take one choice for another."""
     choices = [kind() for kind in CHOICE_TYPES]
     assert len(set(choices)) == len({digest(each) for each in choices}) == len(choices)
-    assert ZeroEffort() == ZeroEffort() != HoldEffort() != ()
+    assert Clamp() == Clamp() != Conditional() != ()
 
 
 def test_digests_are_the_same_in_another_process():
-    make = "bp.make_params(2, [3.0, 1.0], non_finite='hold'), {'b': {'x', 'y', 'z'}, 'a': None}"
+    make = "bp.make_params(2, [3.0, 1.0], anti_windup='conditional'), {'b': {'x', 'y', 'z'}, 'a': None}"
     program = (
         f"import batchpid as bp; from batchpid.arrays.trees import digest; print(digest({make}))"
     )

@@ -18,9 +18,9 @@ def test_params_show_the_options_that_are_on():
 
 def test_every_option_fits_on_three_lines(options):
     params = bp.make_params(JOINTS, **options)
-    pid = bp.BatchPID(params, ENVS, DT, terms=True)
+    pid = bp.BatchPID(params, ENVS, DT)
     pid(np.ones(JOINTS), np.zeros((ENVS, JOINTS)))
-    for shown in (params, pid.state, pid.terms, pid):
+    for shown in (params, pid.state, pid):
         assert len(repr(shown).splitlines()) <= 3
         assert "array" not in repr(shown)
 

@@ -54,7 +54,6 @@ def test_a_write_that_fails_leaves_the_older_file(tmp_path, monkeypatch):
 NOT_FILES = {
     "batchpid/io/files.py": "the atomic writer",
     "sim/engine/sapien/building.py": "text in memory",
-    "sim/view/film.py": "messages in memory",
     "sim/view/view_data.py": "a URDF in a temporary folder",
 }
 

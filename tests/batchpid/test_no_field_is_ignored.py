@@ -27,7 +27,7 @@ FULL = LIMITS | {
     "kp": [9.0, 5.0, 3.0],
     "ki": [9.0, 9.0, 5.0],
     "kd": [2.0, 0.6, 0.3],
-    "anti_windup": ["back_calculation", "conditional", "none"],
+    "anti_windup": "back_calculation",
     "tracking_time": 0.05,
     "continuous": [True, False, True],
     "effort_rate_limit": [300.0, 100.0, 60.0],
@@ -38,7 +38,6 @@ FULL = LIMITS | {
 }
 PLAIN = bp.make_params(1, 1.0)
 NAMES = {
-    "non_finite": ("propagate", "zero", "hold"),
     "measurement_rate": ("difference", "measured"),
     "gain_units": ("effort", "mass_matrix"),
 }
@@ -59,7 +58,7 @@ def changes(params, choices):
             if type(chosen) is not type(leaf):
                 yield f"{name}={other}", name, params._replace(**{name: chosen})
         if isinstance(leaf, np.ndarray):
-            is_mask = name in ("continuous", "conditional", "axes", "force_axes")
+            is_mask = name in ("continuous", "axes")
             yield (
                 name,
                 name,
@@ -101,9 +100,9 @@ TARGETS = {
     "C": lambda p: to_c(p, DT),
     "trajectory": lambda p: to_ros2_control(p, JOINTS, DT, inertia=INERTIA),
 }
-PART_OF = {name: "ki" for name in ("integral_min", "integral_max", "tracking_time", "conditional")}
+PART_OF = {name: "ki" for name in ("integral_min", "integral_max", "tracking_time")}
 """Fields of a term, which its own difference contains."""
-LABELS = {"tracking_time": "anti_windup", "conditional": "anti_windup"}
+LABELS = {"tracking_time": "anti_windup"}
 LABELS |= {f"{of}_{end}": f"{of}_limit" for of in ("effort", "integral") for end in ("min", "max")}
 """Options by which differences name the fields."""
 
@@ -143,36 +142,35 @@ def test_every_field_is_in_an_mjcf_or_a_difference(tmp_path):
         ), name
 
 
-AXES = {"axes": ("x", "rz"), "force_axes": ("y",)}
-
-
-def test_every_field_of_osc_params_changes_the_efforts_or_is_refused():
+def test_every_field_of_osc_params_changes_the_efforts():
     tree = planar((1.0, 0.8, 0.5, 0.4))
-    options = {"integral_gain": 300.0, "integral_limit": 0.2, "limit_margin": 0.5}
-    options |= {
-        name: [axis in chosen for axis in ts.osc_params.AXES] for name, chosen in AXES.items()
-    }
     tree = ts.RigidTree(
         **{**tree_fields(tree), "lower": [-3.0, -3.0, -3.0, -np.inf], "upper": [3.0] * 3 + [np.inf]}
     )
     q = np.array([[2.9, -2.8, 0.7, 9.0], [0.3, 0.4, 2.8, -9.0], [0.3, 0.4, 0.8, 9.0]])
     pose = ts.link_poses(tree, np.add(q, [[0.02], [0.3], [-0.3]]), ["tip"])[:, 0]
+    options = {"integral_gain": 300.0, "integral_limit": 0.2, "limit_margin": 0.5}
+    options |= {"smallest_eigenvalue": 0.5, "position_error_limit": 0.2}
+    options |= {"effort_limit": np.array([[900.0], [6.0], [5.0]]) * np.ones((3, 4))}
     base = ts.make_osc_params(
-        tree, smallest_eigenvalue=0.5, position_error_limit=0.2, rotation_error_limit=0.1, **options
+        tree,
+        DT,
+        rotation_error_limit=0.1,
+        axes=[True, False, False, False, False, True],
+        discretization="implicit",
+        **options,
     )
-    room = np.array([[900.0], [6.0], [5.0]]) * np.ones((3, 4))
-    base = base._replace(effort_min=-room, effort_max=0.9 * room)
 
     def run(params):
         state, results = ts.init(params, 0.7 * q), []
         for at in range(4):
-            moving = {"wrench": np.full((3, 6), 0.3), "twist": np.full((3, 6), 0.1)}
+            moving = {name: np.full((3, 6), 0.1) for name in ("wrench", "twist", "acceleration")}
             inputs = ts.OSCInputs(pose, q + 0.01 * at, 0.3 * q, **moving)
-            state, terms = ts.osc(ts.discretise(params, DT), state, ts.Tool(tree, "tip"), inputs)
+            state, terms = ts.osc(params, state, ts.Tool(tree, "tip"), inputs)
             results += [terms.effort, state.integral]
         return np.concatenate([each.ravel() for each in results])
 
-    assert not ignored(run, base, ts.osc_params.TASK_CHOICES)
+    assert not ignored(run, base, {})
 
 
 def tree_fields(tree):

@@ -42,11 +42,3 @@ def test_replace_changes_the_given_options_alone():
     assert changed.effort_min.tolist() == [[-2, -2]]
     assert changed.tracking_time.tolist() == params.tracking_time.tolist()
     assert params.replace(anti_windup="none").tracking_time is None
-
-
-def test_uniform_strategies_need_no_mask():
-    uniform = bp.make_params(2, 1.0, 1.0, effort_limit=1.0, anti_windup="conditional")
-    mixed = bp.make_params(2, 1.0, 1.0, effort_limit=1.0, anti_windup=["conditional", "none"])
-    assert uniform.conditional is not None
-    assert not isinstance(uniform.conditional, np.ndarray)
-    assert mixed.conditional.tolist() == [[1, 0]]

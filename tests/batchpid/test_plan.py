@@ -1,4 +1,4 @@
-"""Plans: chunks of a slow policy become setpoints, by the formulas of ACT, LeRobot and linear
+"""Plans: chunks of a slow policy become setpoints, by the formulas of ACT and linear
 interpolation, without a step at a seam, within their limits; the same in NumPy, JAX and C.
 """
 
@@ -18,8 +18,7 @@ PERIOD, DT = 1 / 30, 1 / 2000
 PLANS = {
     "align": {"fade": [0.5, 1.0, 0.3], "latest": [2]},
     "newest": {},
-    "ensemble": {"weight": 0.1, "taper": 0.2, "latest": [0]},
-    "average": {"share": 0.6, "rate": 2.0, "acceleration": 15.0},
+    "ensemble": {"weight": 0.1, "latest": [0], "rate": 2.0, "acceleration": 15.0},
     "linear": {"blend": "newest", "interpolation": "linear", "acceleration": [15.0, 9.0, np.inf]},
     "hold": {"blend": "newest", "interpolation": "hold"},
 }
@@ -43,64 +42,41 @@ def run(plan, times, chunks, start=0.0):
     return np.moveaxis(np.array(rows), 1, 0), state
 
 
-def blended(chunks, plan, ticks):
+def aligned(chunks, plan, ticks):
     """Return the rows of the plan (ticks, joints) by the formulas of batchpid/plan/sampling.py;
     chunk k is for the times from k + 1 on.
     """
     knots, rates = np.zeros((2, ticks + plan.horizon, plan.num_joints))
-    weights, rows = np.zeros(len(knots)), np.arange(plan.horizon)
-    options = {name: float(leaf[0, 0]) for name, leaf in plan.leaves().items()}
+    rows, fade = np.arange(plan.horizon), plan.fade[0, 0]
     for k, ((chunk, _),) in chunks.items():
-        old = weights[k + 1 + rows, None]
-        weight = 1 - old * (1 - np.exp(-options.get("weight", 0.0)))
-        if "share" in options:
-            weight = np.where(old > 0, old * options["share"] / (1 - options["share"]), 1.0)
-        if "taper" in options:
-            weight = weight * np.minimum(
-                1, (plan.horizon - rows[:, None]) * PERIOD / options["taper"]
-            )
-        mean = (old * knots[k + 1 + rows] + weight * chunk) / (old + weight)
-        if "fade" in options:
-            time, fade = PERIOD * rows[:, None], options["fade"]
-            offset, slope = knots[k + 1] - chunk[0], rates[k + 1] - (chunk[1] - chunk[0]) / PERIOD
-            rise = np.minimum(5 * time / fade, 1)
-            eased = (offset + fade * slope) * rise * (1 - rise) ** 2 / 5
-            mean = chunk + offset * np.maximum(1 - time / fade, 0) + eased
-        knots[k + 1 :], rates[k + 1 :], weights[k + 1 :] = mean[-1], 0.0, 0.0
-        knots[k + 1 + rows], weights[k + 1 + rows] = mean, (old + weight)[:, 0]
-        rates[k + 1 + rows] = np.gradient(mean, PERIOD, axis=0)
-    return knots[:ticks]
+        offset, slope = knots[k + 1] - chunk[0], rates[k + 1] - (chunk[1] - chunk[0]) / PERIOD
+        time = PERIOD * rows[:, None]
+        rise = np.minimum(5 * time / fade, 1)
+        eased = (offset + fade * slope) * rise * (1 - rise) ** 2 / 5
+        blended = chunk + offset * np.maximum(1 - time / fade, 0) + eased
+        knots[k + 1 :], rates[k + 1 :] = blended[-1], 0.0
+        knots[k + 1 + rows] = blended
+        rates[k + 1 + rows] = np.gradient(blended, PERIOD, axis=0)
+    return knots[1:ticks]
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_ensembles_are_those_of_act_and_averages_those_of_lerobot(seed):
+def test_ensembles_are_those_of_act_and_chunks_are_aligned_by_the_formulas(seed):
     rng = np.random.default_rng(seed)
-    weight, share, horizon = rng.uniform(0, 1), rng.uniform(0.2, 0.9), int(rng.integers(2, 9))
+    weight, horizon = rng.uniform(0, 1), int(rng.integers(2, 9))
     chunks = {k: [(rng.normal(size=(horizon, 3)), (k + 1) * PERIOD)] for k in range(30)}
     kept = {k: chunk for k, chunk in chunks.items() if k == 0 or rng.random() < 0.6}
-    acts, averages = np.zeros((29, 3)), np.zeros((29, 3))
+    acts = np.zeros((29, 3))
     for k in range(29):
         rows = [entry[0][0][k - at] for at, entry in kept.items() if 0 <= k - at < horizon]
         weights = np.exp(-weight * np.arange(len(rows)))
-        if rows:
-            acts[k] = weights @ rows / weights.sum()
-            averages[k] = rows[0]
-        for row in rows[1:]:
-            averages[k] = (1 - share) * averages[k] + share * row
-        if not rows:
-            acts[k], averages[k] = acts[k - 1], averages[k - 1]
-    times, taper = PERIOD * np.arange(30), rng.uniform(0.05, 0.3)
-    ensemble = made("ensemble", horizon=horizon, weight=weight, taper=None, latest=())
-    average = made("average", horizon=horizon, share=share, rate=None, acceleration=None)
-    others = (
-        made("align", horizon=horizon, fade=rng.uniform(0.2, 1.5), latest=()),
-        made("ensemble", horizon=horizon, weight=weight, taper=taper, latest=()),
-        made("average", horizon=horizon, taper=taper, rate=None, acceleration=None),
-    )
-    expected = [(ensemble, acts), (average, averages)]
-    for plan, row in (*expected, *((plan, blended(kept, plan, 30)[1:]) for plan in others)):
-        (setpoint, _, _), _ = run(plan, times, kept)
-        np.testing.assert_allclose(setpoint[1:], row, atol=1e-6)
+        acts[k] = weights @ rows / weights.sum() if rows else acts[k - 1]
+    bare = {"horizon": horizon, "latest": (), "rate": None, "acceleration": None}
+    ensemble = made("ensemble", weight=weight, **bare)
+    offset = made("align", fade=rng.uniform(0.2, 1.5), **bare)
+    for plan, expected in ((ensemble, acts), (offset, aligned(kept, offset, 30))):
+        (setpoint, _, _), _ = run(plan, PERIOD * np.arange(30), kept)
+        np.testing.assert_allclose(setpoint[1:], expected, atol=1e-6)
 
 
 def test_single_rows_in_straight_lines_are_a_linear_interpolator():
@@ -115,7 +91,7 @@ def test_single_rows_in_straight_lines_are_a_linear_interpolator():
     np.testing.assert_allclose(setpoint[1:], expected.reshape(60, 3), atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["align", "newest", "ensemble", "average"])
+@pytest.mark.parametrize("name", ["align", "newest", "ensemble"])
 def test_a_seam_has_no_step_and_no_dip(name):
     def reference(t):
         return 0.5 * np.sin(2.0 * t + np.arange(3))

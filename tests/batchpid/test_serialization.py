@@ -72,17 +72,17 @@ def test_joints_are_matched_by_name(tmp_path):
 def test_a_file_written_by_hand(tmp_path):
     path = tmp_path / "params.yaml"
     path.write_text("""
-format: batchpid-params-1
+format: batchpid-params-2
 joints:
   a: {kp: 4, effort_max: 3}
-  b: {kp: [1, 2.5], ki: 1.0e-3, anti_windup: conditional, continuous: true}
+  b: {kp: [1, 2.5], ki: 1.0e-3, continuous: true}
 """)
     params, names = bp.load_params(path)
     assert names == ["a", "b"]
     assert params.kp.tolist() == [[4, 1], [4, 2.5]]
     assert params.ki.tolist() == [[0, 1e-3]]
     assert params.effort_max.tolist() == [[3, np.inf]]
-    assert params.conditional.tolist() == params.continuous.tolist() == [[0, 1]]
+    assert params.continuous.tolist() == [[0, 1]]
     assert params.effort_min is None
 
 
@@ -91,7 +91,7 @@ joints:
     [
         "!!python/object/apply:os.mkdir [{marker}]",
         (
-            "format: batchpid-params-1\njoints: {{a: {{kp: !!python/object/apply:os.mkdir"
+            "format: batchpid-params-2\njoints: {{a: {{kp: !!python/object/apply:os.mkdir"
             " [{marker}]}}}}"
         ),
     ],
@@ -153,7 +153,7 @@ def test_about_survives_and_does_not_affect_the_params(tmp_path, suffix):
 )
 def test_values_that_the_parser_trips_over_are_refused(value):
     with pytest.raises(bp.InvalidArgumentError):
-        bp.loads_params(f"format: batchpid-params-1\njoints:\n  a:\n    kp: {value}\n")
+        bp.loads_params(f"format: batchpid-params-2\njoints:\n  a:\n    kp: {value}\n")
 
 
 def test_files_that_cannot_be_opened_are_named(tmp_path):
@@ -164,8 +164,8 @@ def test_files_that_cannot_be_opened_are_named(tmp_path):
 
 
 def test_a_file_of_another_version_is_refused():
-    with pytest.raises(bp.InvalidArgumentError, match=r"batchpid-params-2; this one reads"):
-        bp.loads_params("format: batchpid-params-2\njoints: {a: {kp: 1.0}}")
+    with pytest.raises(bp.InvalidArgumentError, match=r"batchpid-params-1; this one reads"):
+        bp.loads_params("format: batchpid-params-1\njoints: {a: {kp: 1.0}}")
 
 
 @pytest.mark.parametrize("suffix", [".yaml", ".json"])

@@ -126,6 +126,18 @@ def test_the_mass_matrix_is_that_half_way_through_the_steps_that_it_serves():
             assert state[env, joint, joint] == pytest.approx(first[env, joint], abs=1e-12)
 
 
+def test_other_units_of_the_gains_start_the_law_again():
+    other = NEUTRAL.params.replace(gain_units="mass_matrix")
+    stages = [
+        next(one for one in stages_of(NEUTRAL._replace(params=params)) if one.name == "law")
+        for params in (NEUTRAL.params, NEUTRAL.params.replace(kp=9.0), other)
+    ]
+    state, _ = stages[0].init(at())
+    moved = state._replace(integral=state.integral + 3.0)
+    assert stages[1].adopt(stages[0], moved, at()) is moved
+    assert (stages[2].adopt(stages[0], moved, at()).integral == state.integral).all()
+
+
 def test_the_inertia_of_friction_is_renewed_by_the_age_of_each_env():
     calls = []
     model = Model(

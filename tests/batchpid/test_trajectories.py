@@ -5,8 +5,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from batchpid.task_space.frames import matrix_of, rotate
-from batchpid.trajectories import minimum_jerk, straight_line, trapezoidal
+from batchpid.trajectories import minimum_jerk
 
 DT = 0.004
 LIMITS = {"max_velocity": [1.0, 2.0, np.inf], "max_acceleration": [3.0, 8.0, 5.0]}
@@ -14,9 +13,8 @@ poses = st.lists(st.lists(st.floats(-3, 3), min_size=3, max_size=3), min_size=1,
     np.array
 )
 MOVES = {
-    "minimum_jerk": lambda a, b: minimum_jerk(a, b, DT, **LIMITS),
-    "minimum_jerk_timed": lambda a, b: minimum_jerk(a, b, DT, duration=0.77),
-    "trapezoidal": lambda a, b: trapezoidal(a, b, DT, **LIMITS),
+    "limited": lambda a, b: minimum_jerk(a, b, DT, **LIMITS),
+    "timed": lambda a, b: minimum_jerk(a, b, DT, duration=0.77),
 }
 
 
@@ -59,18 +57,16 @@ def test_positions_are_the_integral_of_velocities(move, start, target):
 
 @settings(deadline=None, max_examples=15)
 @given(start=poses, target=poses)
-@pytest.mark.parametrize("name", ["minimum_jerk", "trapezoidal"])
-def test_limits_are_kept_at_every_tick(name, start, target):
-    t = MOVES[name](start, target[0])
+def test_limits_are_kept_at_every_tick(start, target):
+    t = MOVES["limited"](start, target[0])
     assert (np.abs(t.velocity) <= np.array(LIMITS["max_velocity"]) * (1 + 1e-9)).all()
     assert (np.abs(t.acceleration) <= np.array(LIMITS["max_acceleration"]) * (1 + 1e-9)).all()
 
 
 @settings(deadline=None, max_examples=15)
 @given(start=poses, target=poses)
-@pytest.mark.parametrize("name", ["minimum_jerk", "trapezoidal"])
-def test_synchronised_joints_move_on_a_straight_line(name, start, target):
-    t = MOVES[name](start, target[0])
+def test_synchronised_joints_move_on_a_straight_line(start, target):
+    t = MOVES["limited"](start, target[0])
     way = target[0] - start
     done = np.divide(
         t.position - start, way, out=np.full_like(t.position, np.nan), where=np.abs(way) > 1e-3
@@ -79,15 +75,6 @@ def test_synchronised_joints_move_on_a_straight_line(name, start, target):
         np.where(np.isnan(done), 2, done), -1
     )
     assert (spread < 1e-9).all()
-
-
-@settings(deadline=None, max_examples=15)
-@given(distance=st.floats(0.01, 5), v=st.floats(0.1, 5), a=st.floats(0.1, 20))
-def test_a_trapezoid_takes_the_time_that_the_textbook_gives(distance, v, a):
-    t = trapezoidal([0.0], [distance], 1e-3, max_velocity=v, max_acceleration=a)
-    expected = distance / v + v / a if distance * a > v * v else 2 * np.sqrt(distance / a)
-    assert t.time[-1] - 1e-3 < expected * (1 + 1e-9)
-    assert t.time[-1] > expected * (1 - 1e-9)
 
 
 def test_minimum_jerk_is_symmetric_and_peaks_at_fifteen_eighths():
@@ -100,8 +87,8 @@ def test_minimum_jerk_is_symmetric_and_peaks_at_fifteen_eighths():
 def test_an_env_moves_alone_as_it_does_among_others():
     rng = np.random.default_rng(0)
     start, target = rng.normal(size=(2, 5, 3))
-    both = trapezoidal(start, target, DT, **LIMITS)
-    alone = trapezoidal(start[3], target[3], DT, **LIMITS)
+    both = MOVES["limited"](start, target)
+    alone = MOVES["limited"](start[3], target[3])
     np.testing.assert_array_equal(both.position[: alone.ticks, 3], alone.position)
     np.testing.assert_array_equal(
         both.position[alone.ticks :, 3], np.broadcast_to(target[3], (both.ticks - alone.ticks, 3))
@@ -123,19 +110,3 @@ def test_the_end_of_a_trajectory_can_be_held():
     np.testing.assert_allclose(t.time, DT * np.arange(1, 31))
     assert (t.position[25:] == [1.0, 2.0]).all()
     assert not t.velocity[25:].any()
-
-
-@pytest.mark.parametrize("sign", [1, -1])
-def test_a_tool_moves_on_a_straight_line_and_turns_about_one_axis(sign):
-    start = np.array([0.1, 0.2, 0.3, 1.0, 0.0, 0.0, 0.0])
-    target = np.array([0.4, 0.0, 0.3, *(sign * np.array([np.cos(0.6), 0.0, np.sin(0.6), 0.0]))])
-    path = straight_line(start, target, DT, duration=0.8)
-    assert np.hstack(path[1:]).shape == (200, 19)
-    np.testing.assert_allclose(path.position[-1, :3], target[:3], atol=1e-12)
-    ends = rotate(
-        matrix_of(np.stack([path.position[-1, 3:], target[3:]])), np.array([1.0, 2.0, 3.0])
-    )
-    np.testing.assert_allclose(*ends, atol=1e-12)
-    angle = 2 * np.arccos(path.position[:, 3])  # about y, from 0 to 1.2 rad
-    np.testing.assert_allclose(np.diff(angle) / DT, path.velocity[1:, 4], atol=0.05)
-    np.testing.assert_allclose(path.velocity[-1], 0, atol=1e-12)

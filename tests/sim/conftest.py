@@ -3,7 +3,7 @@
 import pytest
 from robots import load_bundled
 
-from batchpid.sim import Runner, RunnerOptions
+from batchpid.sim import RunnerOptions
 from batchpid.sim.engine.protocol import load_engine
 
 
@@ -22,7 +22,6 @@ def engine(request, monkeypatch):
         original(options, *args, **{"engine": name, **given})
 
     monkeypatch.setattr(RunnerOptions, "__init__", init)
-    monkeypatch.setitem(Runner.__init__.__kwdefaults__, "engine", name)
     return name
 
 

@@ -113,7 +113,6 @@ VALUES = {
     "tool": ["arm", "hand"],
     "physics": [MujocoSolver(iterations=3), Physics("PGS", 3)],
     "build": [box_of(0.05), box_of(0.1)],
-    "speed_limit": [0.3, 0.6, [0.3, 9.0]],
     "actuators": [bp.Actuators(), MOTORS, bp.make_actuators(2, command_delay=2e-3)],
     "randomization": [Randomization(payload=Uniform(0, 1)), Randomization(payload=Uniform(0, 2))],
     "guard": [bp.make_guard(2, rate=0.5), bp.make_guard(2, rate=0.2)],

@@ -122,7 +122,7 @@ def test_a_block_slides_down_a_slope_as_it_should(tmp_path, engine):
     options = {
         "params": block.params(kp=200, ki=0, kd=5),
         "randomization": world,
-        "contacts": ["block"],
+        "contacts": ["block"] if engine == "mujoco" else None,
     }
     with Runner(block, 1, workers=0, **options) as runner:
         slide = runner.rollout(np.tile(block.start, (60, 1)))
@@ -132,11 +132,9 @@ def test_a_block_slides_down_a_slope_as_it_should(tmp_path, engine):
         found, GRAVITY * (np.sin(angle) - friction * np.cos(angle)), rtol=0.01
     )
     normal = 2.1 * GRAVITY * np.cos(angle)
-    np.testing.assert_allclose(
-        slide.contact_force[30:, 0].mean((0, 1)),
-        [-friction * normal, 0, normal],
-        atol=0.01 * normal,
-    )
+    if engine == "mujoco":
+        force = slide.contact_force[30:, 0].mean((0, 1))
+        np.testing.assert_allclose(force, [-friction * normal, 0, normal], atol=0.01 * normal)
 
 
 BLOCK = """<robot name="block">

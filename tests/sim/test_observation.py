@@ -5,8 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from batchpid.sim import Fault, Runner
-from batchpid.sim.rollout import RESET
+from batchpid.errors import InvalidArgumentError
+from batchpid.sim import Fault, Rollout, Runner
+from batchpid.sim.rollout import PARAMS, RESET
 
 
 @pytest.fixture(scope="module")
@@ -80,3 +81,22 @@ def test_some_ticks_begin_where_those_before_have_ended(rollout, first, start, d
     assert (part.info.draws == rollout.info.draws) == draws
     np.testing.assert_array_equal(part.changes, rollout.changes[first:])
     assert rollout.for_ticks(0, 1).info.faults == rollout.info.faults[:1]
+
+
+def test_joined_rollouts_say_what_was_changed_in_between(panda):
+    setpoints = np.tile(panda.start, (3, 1))
+    with Runner(panda, 2, workers=0, substeps=2) as runner:
+        first = runner.rollout(setpoints, setpoint_rates=0 * setpoints)
+        runner.params = panda.params(kp=5.0)
+        runner.reset(mask=[True, False])
+        second = runner.rollout(setpoints, feedforwards=np.ones_like(setpoints))
+    joined = Rollout.join([first, second])
+    for name, rows in second.arrays().items():
+        np.testing.assert_array_equal(joined.arrays()[name][3:], rows, name)
+    assert joined.changes[1:4].tolist() == [[0, 0]] * 2 + [[RESET | PARAMS, PARAMS]]
+    assert not joined.feedforward[:3].any()
+    assert joined.info.rates
+    assert joined.info.params is first.info.params
+    for parts in ([second, first], [first, second.for_envs([0])]):
+        with pytest.raises(InvalidArgumentError, match="do not follow each other; join"):
+            Rollout.join(parts)

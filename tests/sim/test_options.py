@@ -79,15 +79,12 @@ def test_every_option_is_documented_where_it_is_declared():
 
 
 def test_options_are_plain_values_of_their_documented_type():
-    options = RunnerOptions(
-        PANDA, np.int64(2), substeps=np.int8(3), timestep=np.float32(1e-3), speed_limit=2
-    )
+    options = RunnerOptions(PANDA, np.int64(2), substeps=np.int8(3), timestep=np.float32(1e-3))
     assert (type(options.num_envs), type(options.substeps), type(options.timestep)) == (
         int,
         int,
         float,
     )
-    np.testing.assert_array_equal(options.speed_limit, np.full(PANDA.dof, 2.0))
 
 
 def test_defaults_are_resolved():

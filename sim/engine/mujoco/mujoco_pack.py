@@ -31,7 +31,6 @@ from batchpid.sim.engine.mujoco.model_builder import (
 from batchpid.sim.engine.mujoco.mujoco_sensors import MujocoLinkSensors
 from batchpid.sim.engine.mujoco.mujoco_step import STATE, DataPool, MujocoStep, obstacle, rest
 from batchpid.sim.engine.native import FARTHEST
-from batchpid.sim.engine.native_model import NativeModel, passive_force
 from batchpid.sim.engine.protocol import BASE_AT_REST, Engine, EnginePack
 from batchpid.sim.engine.scene_spec import SOLVERS, SceneSpec, Variation
 from batchpid.task_space.frames import matrix_of, rotate, unrotate
@@ -89,8 +88,8 @@ class MujocoPack(EnginePack):
         if self.steps_natively and self._moves_freely:
             self._free = FreeMotions(robot, self.joint_model, self._sensed)
         if self._constraint is not None and self.steps_natively:
-            reads = self.spec.fixed_base and self.steps_read_force(True, True)
-            self._constraint.use(self.joint_model, None if reads else self._bias_model)
+            force = None if self._reads_bias else self.joint_model
+            self._constraint.use(self.joint_model, force)
         self._change_world(range(self.size))
         self._change_masses(range(self.size))
         self._update(range(self.size))
@@ -153,15 +152,16 @@ class MujocoPack(EnginePack):
     def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
         if self.steps_read_force(gravity, coriolis):
             if self._free is not None:
-                qpos, qvel, _ = self._free.read()
-                return self._bias_model.passive_force(qpos, qvel, True, True)
+                return self._force(self.force_model, True, True)
             return np.array([data.qfrc_bias[self._moves] for data in self.data])
-        return self._model_force(gravity, coriolis)
+        return self._force(self.force_model, gravity, coriolis)
 
-    @cached_property
-    def _bias_model(self) -> NativeModel:
-        """Model of the forces in the equations of motion of the joints, for constraint efforts."""
-        return NativeModel(lambda: self.rigid_tree, "fixed" if self.spec.fixed_base else "free")
+    @property
+    def _reads_bias(self) -> bool:
+        """Whether the forces in the equations of motion are the passive force, with the bits that
+        native steps read.
+        """
+        return self.spec.fixed_base and self.steps_read_force(True, True)
 
     # -- stepping
     # ----------------------------------------------------------------------------------------------
@@ -173,7 +173,7 @@ class MujocoPack(EnginePack):
         """Do one sim step of every robot, with constraint efforts on coupled joints."""
         if self.steps_natively:
             if self._own_step is None:
-                self._own_step = self.compiled_step(False, False, None)
+                self._own_step = self.compiled_step(False, False)
             self._own_step.may_have_failed(self._own_step(self.qf, *np.empty((3, *self.qf.shape))))
             return
         effort = self.qf
@@ -193,13 +193,7 @@ class MujocoPack(EnginePack):
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
         return gravity and coriolis and self._is_model
 
-    def compiled_step(
-        self,
-        gravity: bool,
-        coriolis: bool,
-        speed_limit: Float64 | None,
-        drives: bool = False,
-    ) -> MujocoStep:
+    def compiled_step(self, gravity: bool, coriolis: bool, drives: bool = False) -> MujocoStep:
         arrays = {"qf": self.qf, "sensed": self._sensed}
         if drives:
             arrays |= {"stiffness": self._stiffness, "rate_gain": self._rate_gain}
@@ -209,7 +203,6 @@ class MujocoPack(EnginePack):
             self.models,
             self.rows,
             reads_force,
-            speed_limit,
             arrays,
             self._suspended,
             self._constraint_address,
@@ -219,16 +212,11 @@ class MujocoPack(EnginePack):
     def update_constraint(self, rows: Sequence[int] | slice = slice(None)) -> None:
         if self._constraint is None:
             return
-        if self.spec.fixed_base:
-            # The bias is the passive force, with the bits that native steps read.
+        if self._reads_bias:
             bias = self.passive_force(True, True)
         else:
-            state = self.read_qpos(), self.read_qvel(), True, True, self.read_base_motion()
-            if self.steps_natively:
-                bias = self._bias_model.passive_force(*state)
-            else:
-                bias = passive_force(self.rigid_tree, *state)
-        self._constraint.update(self.joint_mass_matrix, self.read_qpos(), bias, rows)
+            bias = self._force(self.joint_model, True, True)
+        self._constraint.update(self.joint_model.mass_matrix, self.read_qpos(), bias, rows)
 
     # -- changes
     # ----------------------------------------------------------------------------------------------
@@ -257,10 +245,10 @@ class MujocoPack(EnginePack):
             return np.zeros(self.size, bool)
         return ~np.array([np.abs(data.qpos).max() <= FARTHEST for data in self.data])
 
-    def take_sensed(self) -> dict[str, Float64]:
-        sums = self._sensors.quantities(self._sensed)
+    def take_sensed(self, steps: int) -> dict[str, Rows]:
+        means = self._sensors.quantities(self._sensed / steps)
         self._sensed[...] = 0.0
-        return sums
+        return means
 
     def read_base_motion(self) -> Float64 | None:
         if self.spec.fixed_base:
@@ -515,7 +503,7 @@ def _without_warnings() -> Iterator[None]:
 ENGINE = Engine(
     name="mujoco",
     title="MuJoCo",
-    capabilities=frozenset({"base_state", "complete_state"}),
+    capabilities=frozenset({"base_state", "complete_state", "wrenches"}),
     physics=SOLVERS,
     group_size=64,
     make_pack=MujocoPack,

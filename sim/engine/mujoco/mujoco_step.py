@@ -174,8 +174,6 @@ class MujocoStep(NativeStep):
         Working memory, and model and row of the state of each robot.
     reads_force
         Whether to read the forces of gravity and Coriolis; otherwise they are zero.
-    speed_limit
-        Joint speed beyond which the status says so (dof,), or None.
     arrays
         Arrays of the pack (robots, ...) for native code: efforts last applied, sums of the sensors,
         and stiffness and rate gain of the drives, if their targets move within a tick.
@@ -194,7 +192,6 @@ class MujocoStep(NativeStep):
         models: list[MjModel],
         rows: Float64,
         reads_force: bool,
-        speed_limit: Float64 | None,
         arrays: dict[str, Rows],
         skip: Bool,
         constraint: int | None,
@@ -233,7 +230,6 @@ class MujocoStep(NativeStep):
             len(data),
             dof,
             {"skip": skip},
-            speed_limit,
             mujoco=ctypes.addressof(robots),
             gravity=reads_force,
             coriolis=reads_force,

@@ -12,7 +12,7 @@ namespace batchpid {
 constexpr double FARTHEST = 1e6;
 
 // Reasons for which a loop over sim steps has to stop, as bits.
-enum Status : std::int32_t { NOT_FINITE = 1, TOO_FAST = 2, FAILED = 4, NO_NOISE = 8, SENSE = 16 };
+enum Status : std::int32_t { NOT_FINITE = 1, FAILED = 2, NO_NOISE = 4 };
 
 // Group of robots; Python fills in the fields and owns what they point to.
 struct FOR_PYTHON Group {
@@ -21,14 +21,12 @@ struct FOR_PYTHON Group {
   System *const *systems;            // (robots,): of each robot
   float *qf;                         // (robots, dof), constraint efforts included
   char const *skip;                  // (robots,): efforts are not applied
-  double const *speed_limit;         // (dof,), or null
   Mujoco const *mujoco;              // robots in MuJoCo, or null
   Constraint const *constraint;      // of coupled joints, or null
   Joint *const *joints;              // (robots, dof): in SAPIEN, or null without targets of drives that move
   FreeMotion const *lanes;           // robots without an engine, or null
   std::int64_t robots, dof;
   std::int32_t gravity, coriolis;    // parts of the passive force; without both it is zero
-  std::int32_t senses;               // whether Python reads sensors after each sim step
   char message[256];                 // of an exception of the engine
 };
 
@@ -277,14 +275,10 @@ inline std::int32_t try_sim_step(Group &group, double const *effort, double *qpo
                                             : succeeds(group.message, in_sapien);
   if (!good) return FAILED;
   std::int64_t const dof = group.dof;
-  std::int32_t status = group.senses != 0 ? SENSE : 0;
-  std::int64_t far = 0, fast = 0;  // counted, since a loop without branches is of vectors
+  std::int32_t status = 0;
+  std::int64_t far = 0;  // counted, since a loop without branches is of vectors
   for (std::int64_t at = 0; at < group.robots * dof; ++at) far += !(std::fabs(qpos[at]) <= FARTHEST);
-  for (std::int64_t row = 0; group.speed_limit != nullptr && row < group.robots; ++row) {
-    for (std::int64_t j = 0; j < dof; ++j) fast += !(std::fabs(qvel[row * dof + j]) <= group.speed_limit[j]);
-  }
   if (far != 0) status |= NOT_FINITE;
-  if (fast != 0) status |= TOO_FAST;
   return status;
 }
 

@@ -1,12 +1,9 @@
-"""Scenes of one robot: the engine's settings, the robot from its tables, its collision groups, its
-tree in PhysX.
-"""
+"""Scenes of one robot: the engine's settings, the robot from its tables, its collision groups."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import lru_cache
 from threading import RLock
 from typing import Any
@@ -17,15 +14,13 @@ from sapien.wrapper.articulation_builder import ArticulationBuilder
 
 from batchpid.arrays.array_types import Float64
 from batchpid.errors import RobotError
-from batchpid.sim.description.merging import body_tree
-from batchpid.sim.description.tables import CONTACT_FRICTION, Body, Tables
+from batchpid.sim.description.tables import CONTACT_FRICTION
 from batchpid.sim.engine.sapien.limits import Words, filter_words
 from batchpid.sim.engine.sapien.user_content import Frames, HeadlessScene
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.geometry.mesh_files import mesh_bytes
 from batchpid.sim.geometry.shapes import Shape, hull, mesh_file
-from batchpid.task_space.frames import SpatialInertia, from_rpy, matrix_of
-from batchpid.task_space.rigid_tree import RigidTree
+from batchpid.task_space.frames import SpatialInertia, matrix_of
 
 SAPIEN_DISSIPATION = 0.05
 """SAPIEN 3's default of the friction of joints, and of the damping of links [1/s]."""
@@ -274,45 +269,3 @@ def link_frames(spec: SceneSpec, robot: physx.PhysxArticulation) -> Frames:
         name: (entities[at.link], None if at.link == name else Pose(at.position, at.wxyz))
         for name, at in spec.simulated.links.items()
     }
-
-
-@lru_cache(maxsize=8)
-def rounded_tree(spec: SceneSpec) -> RigidTree:
-    """Return the tree of the robot of ``spec`` as PhysX rounds it, all joints independent, the same
-    object for equal specs.
-
-    Before each link but the base comes a link without mass, "LINK (joint)", in the frame of the
-    joint above.
-    """
-    _scene, robot = build_scene(spec, new_system(spec))
-    links = {link.name: link for link in robot.links}
-    rows = []
-    for body in spec.simulated.bodies:
-        link = links[body.name]
-        place = link.cmass_local_pose
-        axes = matrix_of(_wxyz(place))
-        moments = np.diag([float(str(moment)) for moment in link.inertia])
-        row = Body(body.name, None, mass=link.mass, center=np.asarray(place.p, float))
-        row = row._replace(inertia=axes @ moments @ axes.T)
-        if body.joint is not None:
-            # SAPIEN's joint has a frame in the parent and one in the child: the link between has the first.
-            above = f"{body.name} (joint)"
-            moving = replace(body.joint, axis=(1.0, 0.0, 0.0))
-            rows.append(_placed(Body(above, moving), link.joint.pose_in_parent))
-            fixed = replace(body.joint, type="fixed", parent_link=above)
-            row = _placed(row._replace(joint=fixed), link.joint.pose_in_child.inv())
-        rows.append(row)
-    tables = Tables(tuple(rows), (), {})
-    return body_tree(tables, spec.fixed_base, spec.gravity)
-
-
-def _placed(row: Body, pose: Pose) -> Body:
-    """Return a body at one of SAPIEN's poses in its parent."""
-    return row._replace(position=np.asarray(pose.p, float), wxyz=_wxyz(pose))
-
-
-def _wxyz(pose: Pose) -> Float64:
-    """Return the rotation of one of SAPIEN's poses, by roll, pitch and yaw, as SAPIEN's own
-    dynamics take it.
-    """
-    return from_rpy(np.asarray(pose.rpy, float))

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -32,15 +31,13 @@ from batchpid.sim.engine.sapien.building import (
     engine_settings,
     link_frames,
     new_system,
-    rounded_tree,
     set_inertia,
 )
-from batchpid.sim.engine.sapien.calls import SapienLinkSensors, SapienStep, obstacle
+from batchpid.sim.engine.sapien.calls import SapienStep, obstacle
 from batchpid.sim.engine.sapien.limits import refusals, shortfalls
 from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, write_root
 from batchpid.sim.engine.scene_spec import PHYSICS, SceneSpec, Variation
 from batchpid.task_space.frames import matrix_of, unrotate
-from batchpid.task_space.rigid_tree import RigidTree
 
 
 class Pack(EnginePack):
@@ -69,7 +66,7 @@ class Pack(EnginePack):
         # SAPIEN frees a scene's robot with the Python Scene, and then steps an empty world in
         # silence.
         self._scenes, self.robots = map(list, zip(*built, strict=True))
-        self._stepped = np.zeros(size, bool)  # robots that did a sim step since they were built
+        self._stepped = np.zeros(size, bool)  # robots that did a sim step since they were placed
         self._contents = []
         if spec.build is not None:
             with engine_settings(spec):
@@ -95,11 +92,6 @@ class Pack(EnginePack):
             ]
             if self.steps_natively:
                 self._constraint.use(self.joint_model, None)
-        self._sensors = (
-            SapienLinkSensors(spec, self.robots, self.systems)
-            if spec.contacts or spec.wrenches
-            else None
-        )
         self._bind()
         if variation is not None:
             self.write_joints(None)
@@ -138,8 +130,6 @@ class Pack(EnginePack):
         self._stepped[...] = True
         for system in self.systems:
             system.step()
-        if self._sensors is not None:
-            self._sensors.add()
 
     def _apply(self, qf: Float32) -> None:
         """Apply efforts to the joints."""
@@ -147,25 +137,15 @@ class Pack(EnginePack):
             self.robots[row].set_qf(qf[row])
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
-        # To compute a force, PhysX overwrites the joint forces that the sensors read after the
-        # step.
-        return self.spec.fixed_base and self._is_model and self._sensors is None
+        return self.spec.fixed_base and self._is_model
 
-    def compiled_step(
-        self,
-        gravity: bool,
-        coriolis: bool,
-        speed_limit: Float64 | None,
-        drives: bool = False,
-    ) -> SapienStep:
+    def compiled_step(self, gravity: bool, coriolis: bool, drives: bool = False) -> SapienStep:
         return SapienStep(
             self.robots,
             self.systems,
             {"qf": self._joint_qf, "skip": self._suspended},
             self._stepped,
-            speed_limit,
             self._joints if drives else [],
-            None if self._sensors is None else self._sensors.add,
             gravity=gravity,
             coriolis=coriolis,
             constraint=self._constraint_address,
@@ -174,11 +154,7 @@ class Pack(EnginePack):
     def update_constraint(self, rows: Sequence[int] | slice = slice(None)) -> None:
         if self._constraint is not None:
             passive = self._own_force(True, True)
-            self._constraint.update(self.joint_mass_matrix, self.read_qpos(), passive, rows)
-
-    @cached_property
-    def rigid_tree(self) -> RigidTree:
-        return rounded_tree(self.spec)
+            self._constraint.update(self.joint_model.mass_matrix, self.read_qpos(), passive, rows)
 
     def _renew(self, rows: Sequence[int]) -> None:
         """Rebuild the robots ``rows`` in new systems, in which earlier contacts have no influence
@@ -215,7 +191,6 @@ class Pack(EnginePack):
                 joint.set_armature(armature)
             _disable_gravity(robot, bool(self._suspended[row]))
             self.robots[row] = robot
-        self._stepped[rows] = False
         self._bind()
 
     def read_qpos(self) -> Float64:
@@ -235,7 +210,7 @@ class Pack(EnginePack):
     def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
         if self.steps_read_force(gravity, coriolis):
             return self._own_force(gravity, coriolis)
-        return self._model_force(gravity, coriolis)
+        return self._force(self.force_model, gravity, coriolis)
 
     def write_qf(self, effort: Rows) -> None:
         self.qf[...] = effort
@@ -267,8 +242,6 @@ class Pack(EnginePack):
             _, moving, turning = np.split(base, [7, 10])
             self.robots[row].set_root_linear_velocity(moving)
             self.robots[row].set_root_angular_velocity(turning)
-        if self._sensors is not None:
-            self._sensors.place(rows)
 
     def _moved_to_origin(self, rows: Sequence[int], roots: Float64, sign: float) -> Float64:
         """Return ``roots`` (n, 13) of robots ``rows`` with the velocity of the link's origin for
@@ -284,10 +257,22 @@ class Pack(EnginePack):
         velocity = roots[:, 7:10] + sign * np.cross(roots[:, 10:], arm)
         return np.concatenate([roots[:, :7], velocity, roots[:, 10:]], axis=1)
 
-    def take_sensed(self) -> dict[str, Float64]:
-        if self._sensors is None:
-            return {}
-        return self._sensors.take()
+    def take_sensed(self, steps: int) -> dict[str, Rows]:
+        """Return the contact forces of the last sim step: the normal forces, which PhysX
+        reports.
+        """
+        sensed = self.spec.contacts or ()
+        bodies = self.spec.simulated.links
+        forces = np.zeros((self.size, len(sensed), 3))
+        for row in np.flatnonzero(self._stepped) if sensed else ():
+            entities = {link.name: link.entity for link in self.robots[row].links}
+            places = {entities[bodies[link].link]: place for place, link in enumerate(sensed)}
+            for contact in self.systems[row].get_contacts():
+                impulse = np.sum([point.impulse for point in contact.points], axis=0)
+                for body, sign in zip(contact.bodies, (1.0, -1.0), strict=True):
+                    if (place := places.get(body.entity)) is not None:
+                        forces[row, place] += sign * impulse / self.spec.timestep
+        return {"contact_force": forces, "touching": np.abs(forces).sum(2)} if sensed else {}
 
     def write_state(
         self,
@@ -324,14 +309,12 @@ class Pack(EnginePack):
             write_root(robot, base)
             robot.set_qpos(position.astype(np.float32))
             robot.set_qvel(velocity.astype(np.float32))
-            self.qf[row] = 0.0
+            self.qf[row] = self._stepped[row] = 0.0
             robot.set_qf(self.qf[row])
             if self._contents:
                 self._contents[row].reset()
         if self._constraint is not None:
             self._constraint.place(rows, qpos)
-        if self._sensors is not None:
-            self._sensors.place(rows)
 
     def vary(self, rows: Sequence[int], variation: Variation) -> None:
         self._change(rows, variation)
@@ -468,7 +451,7 @@ def _disable_gravity(robot: Any, disabled: bool) -> None:
 ENGINE = Engine(
     name="sapien",
     title="SAPIEN",
-    capabilities=frozenset({"build", "partial_force", "sapien_dissipation"}),
+    capabilities=frozenset({"build", "sapien_dissipation"}),
     physics=PHYSICS,
     group_size=4,
     make_pack=Pack,

@@ -83,7 +83,11 @@ EXPRESSIBLE = {
         "anti_windup": "back_calculation",
         "tracking_time": [0.1, 0.5, 0.02],
     },
-    "mixed": {"effort_limit": 2.0, "anti_windup": ["back_calculation", "conditional", "none"]},
+    "mixed": {
+        "effort_limit": 2.0,
+        "anti_windup": "back_calculation",
+        "tracking_time": [0.1, math.inf, math.inf],
+    },
 }
 
 

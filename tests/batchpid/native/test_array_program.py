@@ -2,6 +2,7 @@
 threads.
 """
 
+from contextlib import contextmanager
 from unittest import mock
 
 import numpy as np
@@ -26,6 +27,14 @@ from batchpid.native.tracing import Namespace, Symbol, trace
 pytestmark = pytest.mark.skipif(bool(obstacle()), reason="there are no native programs")
 DTYPES = st.sampled_from([np.float64, np.float32])
 SHAPES = st.tuples(st.sampled_from([1, 3, 64, 250]), st.sampled_from([1, 2, 7, 9, 16, 33, 100]))
+
+
+@contextmanager
+def on_cores(count):
+    """Make programs of small arrays for ``count`` threads."""
+    cores = mock.patch.object(array_program.os, "sched_getaffinity", return_value=range(count))
+    with cores, mock.patch.object(array_program, "NUMBERS_PER_THREAD", 64):
+        yield
 
 
 def assert_identical(ours, theirs):
@@ -80,10 +89,8 @@ def test_every_operation_on_inputs_of_every_shape(shape, dtype, seed, data):
     ]
     inputs.append(numbers(rng, (*shape, columns), 0.01, dtype))
     wide = [*np.broadcast_arrays(*inputs[:3]), inputs[3]]
-    with mock.patch.object(array_program, "NUMBERS_PER_THREAD", 64):
-        program = ArrayProgram(
-            trace(every_operation, 0, 4, dtype), (), 4, shape, dtype, data.draw(st.integers(1, 4))
-        )
+    with on_cores(data.draw(st.integers(1, 4))):
+        program = ArrayProgram(trace(every_operation, 0, 4, dtype), (), 4, shape, dtype)
     with np.errstate(all="ignore"):
         assert_identical(program(*inputs), every_operation(*wide))
 
@@ -191,8 +198,8 @@ def test_histories_are_changed_in_place(shape, samples, seed, threads):
         xp = value.__array_namespace__()
         return [delay.read(push_history(held, value), (whole, fraction), None, xp)]
 
-    with mock.patch.object(array_program, "NUMBERS_PER_THREAD", 64):
-        program = ArrayProgram(trace(function, 2, 2), late, 2, shape, threads=threads)
+    with on_cores(threads):
+        program = ArrayProgram(trace(function, 2, 2), late, 2, shape)
     ours, theirs = history.copy(), history
     for _ in range(3):
         value = rng.normal(size=shape)

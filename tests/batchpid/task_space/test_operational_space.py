@@ -18,9 +18,7 @@ HAND = "panda_hand"
 
 
 def terms_of(params, state, goal, qpos, qvel, dynamics, **options):
-    return ts.osc(
-        ts.discretise(params, DT), state, dynamics, ts.OSCInputs(goal, qpos, qvel, **options)
-    )[1]
+    return ts.osc(params, state, dynamics, ts.OSCInputs(goal, qpos, qvel, **options))[1]
 
 
 def accelerations(d, effort):
@@ -43,24 +41,14 @@ def goals(tree, link, seed=3):
 
 
 @pytest.mark.parametrize(("name", "link"), [("panda", HAND), ("jaco2", "j2s7s300_link_7")])
-@pytest.mark.parametrize("frame", ["world", "tool"])
-def test_the_tool_has_the_acceleration_and_fingers_their_own(name, link, frame):
+def test_the_tool_has_the_acceleration_and_fingers_their_own(name, link):
     tree, rows = tree_of(name), 20
     qpos, qvel = states(tree, rows)
     rng = np.random.default_rng(1)
     goal, twist, acceleration = goals(tree, link)(rows), *rng.normal(size=(2, rows, 6))
-    stiffness, damping, limit = (
-        rng.uniform(50, 200, (rows, 6)),
-        rng.uniform(10, 20, (rows, 6)),
-        1e-6,
-    )
-    options = {
-        "stiffness": stiffness,
-        "damping": damping,
-        "smallest_eigenvalue": limit,
-        "frame": frame,
-    }
-    params = ts.make_osc_params(tree, posture_stiffness=30.0, **options)
+    stiffness, ratio = rng.uniform(50, 200, (rows, 6)), rng.uniform(0.5, 1, (rows, 6))
+    options = {"stiffness": stiffness, "damping_ratio": ratio, "smallest_eigenvalue": 1e-6}
+    params = ts.make_osc_params(tree, DT, posture_stiffness=30.0, **options)
     state = ts.OSCState(qpos + 0.1 * rng.normal(size=qpos.shape))
     d = ts.task_dynamics(tree, qpos, qvel, link)
     inputs = {"twist": twist, "acceleration": acceleration, "feedforward": np.full_like(qpos, 0.5)}
@@ -70,11 +58,7 @@ def test_the_tool_has_the_acceleration_and_fingers_their_own(name, link, frame):
     for part, most in ((error[:, :3], 0.1), (error[:, 3:], 0.5)):
         part *= np.minimum(1, most / np.linalg.norm(part, axis=1, keepdims=True))
     rate = twist - (d.jacobian * qvel[:, None]).sum(-1)
-    turn = frames.matrix_of(d.pose[:, 3:])
-    if frame == "tool":
-        vectors = np.stack([error, rate, acceleration, tool], axis=-1)
-        error, rate, acceleration, tool = np.moveaxis(frames.in_axes(turn, vectors), -1, 0)
-    wanted = stiffness * error + damping * rate + acceleration
+    wanted = stiffness * error + 2 * ratio * np.sqrt(stiffness) * rate + acceleration
     np.testing.assert_allclose(tool, wanted, atol=1e-8 * np.abs(wanted).max())
     others = ~tree.chain(link)
     a_n = 30 * (state.posture - qpos) - 2 * np.sqrt(30) * qvel
@@ -86,13 +70,12 @@ def test_the_tool_has_the_acceleration_and_fingers_their_own(name, link, frame):
 def test_the_posture_does_not_move_the_tool():
     tree = tree_of("panda")
     qpos, qvel = states(tree, 50)
-    for axes in (None, [True] * 3 + [False] * 3, [False, True, True, True, False, True]):
-        params = ts.make_osc_params(tree, axes=axes, smallest_eigenvalue=1e-9)
+    for axes in ([True] * 6, [True] * 3 + [False] * 3, [False, True, True, True, False, True]):
+        params = ts.make_osc_params(tree, DT, axes=axes, smallest_eigenvalue=1e-9)
         d = ts.task_dynamics(tree, qpos, qvel, HAND)
         state, goal = ts.init(params, qpos + 0.3), goals(tree, HAND)(50)
         terms = terms_of(params, state, goal, qpos, qvel, d)
-        moved = moved_by(d, tree.chain(HAND), terms.posture)
-        moved = moved if axes is None else moved[:, axes]
+        moved = moved_by(d, tree.chain(HAND), terms.posture)[:, axes]
         assert np.abs(moved).max() < 1e-9 * np.abs(terms.posture).max()
         assert np.abs(terms.posture).max() > 1
 
@@ -106,7 +89,7 @@ def test_saturation_scales_the_task_first_and_then_the_posture(seed, tight):
     goal, state = goals(tree, HAND, seed + 1)(rows), ts.OSCState(qpos + rng.normal(size=qpos.shape))
     d = ts.task_dynamics(tree, qpos, 0.1 * qvel, HAND)
     limit = np.abs(d.bias).max() * tight * rng.uniform(0.5, 2, (rows, tree.dof))
-    params = ts.make_osc_params(tree, effort_limit=limit)
+    params = ts.make_osc_params(tree, DT, effort_limit=limit)
     terms = terms_of(params, state, goal, qpos, 0.1 * qvel, d)
     chain = tree.chain(HAND)
     base = (terms.unsaturated - terms.task - terms.posture)[:, chain]
@@ -133,8 +116,10 @@ def test_a_row_does_not_depend_on_the_others_and_nan_stays_alone():
     qpos[2], qvel[3] = np.nan, np.inf
     goal, state = goals(tree, HAND)(rows), ts.OSCState(qpos + 0.1)
     goal[5, 0] = np.nan
-    for options in ({}, {"frame": "tool"}, {"axes": [True] * 3 + [False] * 3}):
-        params = ts.make_osc_params(tree, effort_limit=60.0, smallest_eigenvalue=0.05, **options)
+    for options in ({}, {"axes": [True] * 3 + [False] * 3}):
+        params = ts.make_osc_params(
+            tree, DT, effort_limit=60.0, smallest_eigenvalue=0.05, **options
+        )
 
         def terms_for(chosen, params=params):
             part = ts.OSCState(state.posture[chosen])
@@ -154,43 +139,20 @@ def test_a_row_does_not_depend_on_the_others_and_nan_stays_alone():
                 np.testing.assert_array_equal(part, whole[chosen])
 
 
-def test_a_selected_force_is_that_of_the_wrench():
-    """The posture does not act on an axis of force; on an axis that is free it does."""
-    tree, rows = tree_of("panda"), 10
-    qpos, _ = states(tree, rows)
-    d = ts.task_dynamics(tree, qpos, 0 * qpos, HAND)
-    axes = np.array([True, True, False, True, True, False])
-    wrench, chain = np.array([0.0, 0.0, -20.0, 0.0, 0.0, 0.0]), tree.chain(HAND)
-    for frame in ("world", "tool"):
-        params = ts.make_osc_params(
-            tree, axes=axes, force_axes=[False, False, True] + [False] * 3, frame=frame
-        )
-        inputs = params, ts.OSCState(qpos + 0.3 * chain), d.pose, qpos, 0 * qpos, d
-        terms = terms_of(*inputs, wrench=np.tile(wrench, (rows, 1)))
-        np.testing.assert_allclose(terms.wrench, np.tile(wrench, (rows, 1)), atol=1e-9)
-        tool = moved_by(d, chain, terms.posture)
-        turn = frames.matrix_of(d.pose[:, 3:])
-        tool = tool if frame == "world" else frames.in_axes(turn, tool[..., None])[..., 0]
-        assert np.abs(tool[~terms.near_singular, :5]).max() < 1e-9
-        assert np.abs(tool[:, 5]).max() > 0.1
-
-
-def test_the_state_is_the_posture_and_rows_of_it_reset():
-    tree = planar()
-    params = ts.make_osc_params(tree)
-    state = ts.init(params, np.zeros((3, 2)))
-    again = ts.reset(params, state, np.ones((3, 2)), np.array([False, True, False]))
-    np.testing.assert_array_equal(again.posture, [[0, 0], [1, 1], [0, 0]])
-    assert "3 envs" in repr(again)
-    assert "stiffness 150" in repr(params)
+def test_the_state_is_the_posture():
+    params = ts.make_osc_params(planar(), DT)
+    state = ts.init(params, np.ones((3, 2)))
+    np.testing.assert_array_equal(state.posture, 1.0)
+    assert "3 envs" in repr(state)
+    assert "kp 150" in repr(params)
 
 
 @pytest.mark.parametrize("native", ["0", "1"])
 @pytest.mark.parametrize("name", ["setpoint", "twist", "wrench", "feedforward", "qvel"])
 def test_inputs_of_a_step_are_checked(monkeypatch, name, native):
     tree, qpos = planar(), np.zeros((2, 2))
-    goal, params = ts.link_poses(tree, qpos, ["tip"])[:, 0], ts.make_osc_params(tree)
+    goal, params = ts.link_poses(tree, qpos, ["tip"])[:, 0], ts.make_osc_params(tree, DT)
     inputs = ts.OSCInputs(goal, qpos, qpos)._replace(**{name: np.zeros((2, 4))})
     monkeypatch.setenv("BATCHPID_NATIVE", native)
     with pytest.raises(InvalidArgumentError, match=f"{name}: has shape"):
-        ts.osc(ts.discretise(params, DT), ts.init(params, qpos), ts.Tool(tree, "tip"), inputs)
+        ts.osc(params, ts.init(params, qpos), ts.Tool(tree, "tip"), inputs)

@@ -18,16 +18,13 @@ def test_the_header_is_that_of_the_function(batchpid, tmp_path):
         "tuned",
         "--timestep",
         "0.001",
-        "--limits",
         "--prefix",
         "arm",
         "--out",
     ]
     status, said, _ = batchpid(*words, out)
     panda = Robot.load("panda")
-    exported = to_c(
-        panda.tuned(), 0.001, joint_names=panda.joint_names, guard=panda.guard(), prefix="arm"
-    )
+    exported = to_c(panda.tuned(), 0.001, joint_names=panda.joint_names, prefix="arm")
     assert (status, out.read_text()) == (0, exported.text)
     lines = [
         "panda: 9 dof",

@@ -2,9 +2,6 @@
 the command.
 """
 
-import io
-import itertools
-import sys
 import warnings
 from collections import defaultdict
 from functools import cache
@@ -14,7 +11,7 @@ import pytest
 import tyro
 from commands_that_write import WORDS
 
-from batchpid.sim.cli.commands import COMMANDS, bar
+from batchpid.sim.cli.commands import COMMANDS
 
 SEVERAL = {("compare", "--gains"), ("compare", "--engine")}
 """Flags that take several values in one command, and one in the others."""
@@ -44,7 +41,7 @@ def choices(command):
 
 
 def test_there_are_few_flags():
-    assert sum(len(flags(command).keys() - {"-h", "--help"}) for command in COMMANDS) <= 82
+    assert sum(len(flags(command).keys() - {"-h", "--help"}) for command in COMMANDS) <= 75
 
 
 def test_a_flag_takes_one_kind_of_value():
@@ -132,8 +129,6 @@ def written(folder):
         ("demo pander", "no robot 'pander'"),
         ("demo --picture demo.jpg", "picture: unknown file format"),
         ("rollout --setpoint 1 2", "setpoint: has shape (2,)"),
-        ("rollout --control osc --setpoint 1 2", "setpoint: has shape (2,)"),
-        ("rollout --control osc --gains tuned", "gains: are for the control of joints"),
         ("rollout --out a.npz", "out: unknown file format"),
         ("rollout --gains tunned", "use tuned, designed, "),
         ("compare --gains drive:-1,3", "gains: is no drive"),
@@ -160,27 +155,6 @@ def test_flags_that_contradict_each_other_are_answered_in_one_line(
     assert said.count("\n") <= 1  # the first line
     assert complaint.startswith("batchpid: ")
     assert message in complaint
-
-
-class Terminal(io.StringIO):
-    """A stderr that may be a terminal."""
-
-    def __init__(self, is_terminal):
-        super().__init__()
-        self.is_terminal = is_terminal
-
-    def isatty(self):
-        return self.is_terminal
-
-
-def test_a_terminal_has_a_bar_and_a_pipe_lines_with_the_remaining_time(monkeypatch):
-    for is_terminal in (True, False):
-        monkeypatch.setattr("sys.stderr", Terminal(is_terminal))
-        monkeypatch.setattr("time.monotonic", itertools.count(step=4).__next__)
-        assert list(bar("working")(range(8))) == [*range(8)]
-        said = sys.stderr.getvalue()
-        assert said.count("\n") == (0 if is_terminal else 3)
-    assert said.splitlines()[-1] == "batchpid: working: 7 of 8 it, 32 s, about 5 s left"
 
 
 def test_no_default_output_needs_a_folder_of_the_user(batchpid):

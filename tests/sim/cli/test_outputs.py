@@ -1,13 +1,9 @@
 """Output files: no command replaces one without --force, and default names describe the content."""
 
-import dataclasses
-import os
 import re
 
 import pytest
 from commands_that_write import SHORT, WORDS, output, output_flags
-
-from batchpid.sim.cli.commands import COMMANDS
 
 
 @pytest.fixture
@@ -54,39 +50,3 @@ def test_the_demo_can_be_repeated_for_another_robot_and_with_force(batchpid, tmp
         "panda-demo.png",
         "jaco2-demo.png",
     }
-
-
-INPUTS = {
-    "gains": "a.yaml",
-    "actuators": "a.yaml",
-    "randomize": "a.yaml",
-    "trajectory": "m.csv",
-}
-"""Flags of files to read, besides those in WORDS."""
-
-
-@pytest.mark.parametrize("make", [os.symlink, os.link])
-@pytest.mark.parametrize(("name", "flag"), output_flags())
-def test_a_file_that_a_command_reads_is_never_replaced(
-    name, flag, make, files, batchpid, tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    names = {field.name for field in dataclasses.fields(COMMANDS[name].record())}
-    words = [
-        *WORDS[name],
-        *(word for each, file in INPUTS.items() if each in names for word in (f"--{each}", file)),
-    ]
-    read = {file for file in words if str(file).endswith((".urdf", ".yaml", ".csv", ".h5"))}
-    for file in read:
-        (tmp_path / file).write_text("kept")
-    for file in read:
-        path = tmp_path / output(name, flag)
-        make(tmp_path / file, path)
-        status, said, complaint = batchpid(*words, f"--{flag}", path, "--force")
-        assert (status, said, f"batchpid: {flag}: is a file to read" in complaint) == (
-            2,
-            "",
-            True,
-        ), complaint
-        assert (tmp_path / file).read_text() == "kept"
-        path.unlink()

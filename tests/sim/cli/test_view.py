@@ -100,7 +100,7 @@ def test_a_recording_without_robot_asks_for_its_file(batchpid, tmp_path):
     arm = Robot.load(path)
     path.unlink()
     run = write(tmp_path / "run.h5", arm, name="arm")
-    problem = "'arm' is not bundled, and the recording holds no description of it; name its URDF"
+    problem = "robot: of the recording, 'arm', is unknown: its file was gone; name its URDF"
     assert problem in batchpid("view", "--play", run)[2]
     path.write_text(load_bundled("panda").path.read_text())
     assert batchpid("view", path, *SHORT, "--play", run, "--time-limit", 0.1)[0] == 0

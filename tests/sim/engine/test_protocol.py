@@ -14,7 +14,6 @@ import batchpid.sim.engine.protocol as engines
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.friction import Friction
 from batchpid.sim import Runner, RunnerOptions
-from batchpid.task_space.rigid_tree import RigidTree
 
 PANDA = load_bundled("panda")
 PANDA.has_ground  # noqa: B018
@@ -31,7 +30,6 @@ class DoubleIntegrators:
         self.spec, self.size, self.first_env, self.dof = spec, size, first_env, len(spec.joints)
         self.qf = np.zeros((size, self.dof))
         self.friction, self.armature = Friction(), np.zeros((1, self.dof))
-        self.rigid_tree = sliders(spec)
         self._state, self._moves = np.zeros((2, size, self.dof)), np.ones((size, 1))
 
     def read_qpos(self):
@@ -42,9 +40,6 @@ class DoubleIntegrators:
 
     def passive_force(self, gravity, coriolis):
         return np.zeros_like(self.qf)
-
-    def joint_mass_matrix(self, qpos):
-        return np.tile(np.eye(qpos.shape[1]), (len(qpos), 1, 1))
 
     def write_qf(self, effort):
         self.qf[...] = effort
@@ -87,24 +82,6 @@ class Solver:
     """Settings of the toy."""
 
     order: int
-
-
-def sliders(spec):
-    """Return joints of 1 kg that nothing couples or loads, as sliders side by side."""
-    count = len(spec.joints)
-    names = tuple(joint.name for joint in spec.joints)
-    return RigidTree(
-        links=("base", *names),
-        parent=np.array([-1, *np.zeros(count)]),
-        joint_types=("fixed", *["prismatic"] * count),
-        joint_names=names,
-        position=np.zeros((count + 1, 3)),
-        wxyz=np.tile([1.0, 0.0, 0.0, 0.0], (count + 1, 1)),
-        axis=np.tile([1.0, 0.0, 0.0], (count + 1, 1)),
-        mass=np.ones(count + 1),
-        center=np.zeros((count + 1, 3)),
-        inertia=np.zeros((count + 1, 3, 3)),
-    )
 
 
 ENGINE = engines.Engine(

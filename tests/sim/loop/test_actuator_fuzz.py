@@ -32,7 +32,7 @@ def check(robot, seeds):
     rng = np.random.default_rng(seeds[0])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FaultWarning)
-        with Runner(robot, ENVS, workers=0, speed_limit=1e4, substeps=10) as runner:
+        with Runner(robot, ENVS, workers=0, substeps=10) as runner:
             for seed in seeds:
                 runner.actuators = random_actuators(seed, robot.dof)
                 runner.reset()

@@ -219,17 +219,14 @@ def test_a_floating_base_is_refused():
         OperationalSpace(Robot.load("panda", fixed_base=False), HAND)
 
 
-class Called(OperationalSpace):
-    """The same controller, called by Python at every sim step."""
-
-
-@pytest.mark.parametrize("kind", [OperationalSpace, Called])
+@pytest.mark.parametrize("native", ["0", "1"])
 @pytest.mark.parametrize("backend", ["numpy", pytest.param("jax", marks=pytest.mark.slow)])
-def test_joints_with_limited_efforts_are_reported(panda, kind, backend):
+def test_joints_with_limited_efforts_are_reported(panda, native, backend, monkeypatch):
     """The law scales its efforts to the limits, so that the runner has nothing to clip."""
     if backend == "jax":
         pytest.importorskip("jax")
-    control = kind(panda, HAND, effort_limit=np.where(np.arange(9) < 7, 30.0, 100.0))
+    monkeypatch.setenv(SWITCH, native)
+    control = OperationalSpace(panda, HAND, effort_limit=np.where(np.arange(9) < 7, 30.0, 100.0))
     goals = np.tile(control.command.neutral, (4, 2, 1))
     goals[:, 1, 2] += 0.3
     with Runner(

@@ -29,35 +29,31 @@ def test_frames_equal_those_of_a_runner(live, panda):
             live.advance()
             observation = runner.step(live.setpoint, substeps=substeps)
     assert observation.effort.any()
-    assert_identical(live.frame().observation.for_envs(0), observation)
-    history = live.history()
-    np.testing.assert_allclose(history.time, live.period * np.arange(7))
-    np.testing.assert_array_equal(history.qpos[-1], observation.qpos)
+    assert_identical(live.observation, observation)
+    assert live.time == pytest.approx(6 * live.period)
 
 
 def test_setpoints_are_set_for_one_joint_or_for_all(live):
+    assert (live.setpoint == live.robot.target).all()
+    live.set_setpoint(live.robot.start)
     live.set_setpoint(0.5, joint=2)
-    assert live.frame().setpoint[0, :, 2].tolist() == [0.5, 0.5, 0.5]
-    live.randomize_setpoints()
-    assert (live.setpoint >= live.robot.lower).all()
-    assert (live.setpoint <= live.robot.upper).all()
-    assert np.ptp(live.setpoint, axis=0).max() > 0.1
+    expected = [*live.robot.start[:2], 0.5, *live.robot.start[3:]]
+    assert live.setpoint.tolist() == [expected] * 3
     live.advance()
     live.reset()
-    assert live.history().time.tolist() == [0.0]
-    np.testing.assert_allclose(live.frame().qpos[0], live.start, atol=1e-6)
+    assert live.time == 0.0
+    np.testing.assert_allclose(live.observation.qpos, live.start, atol=1e-6)
 
 
 @pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 def test_a_robot_that_diverged_comes_back_with_a_reset(panda):
     params = panda.params(kd=5000.0, effort_limit=np.inf)
     live = LiveSimulation(panda, 3, workers=0, spread=0.0, physics="fast", params=params)
-    live.set_setpoint(panda.target)
     with pytest.warns(FaultWarning):
         run(live, 12)
-    assert not live.frame().ok.all()
+    assert not live.observation.ok.all()
     live.reset()
-    assert live.frame().ok.all()
+    assert live.observation.ok.all()
     live.close()
 
 
@@ -66,8 +62,9 @@ def test_a_robot_without_settings_gets_gains_that_hold_it(tmp_path, panda):
     path.write_text(panda.path.read_text())
     robot = Robot.load(path)
     live = LiveSimulation(robot, 1, workers=0)
+    live.set_setpoint(robot.start)
     run(live, 30)
-    assert np.abs(live.frame().qpos[0] - robot.start)[:, :7].max() < 0.1
+    assert np.abs(live.observation.qpos - robot.start)[:, :7].max() < 0.1
     live.close()
 
 

@@ -9,7 +9,6 @@ import math
 import sys
 import textwrap
 from collections import Counter
-from collections.abc import Iterable
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,13 +22,10 @@ from batchpid.sim import Finding, Robot, Rollout, read_recording
 from batchpid.sim.cli.flags import Engine, Gains, Workers, flag
 from batchpid.sim.cli.gains import law_gains
 from batchpid.sim.description.merging import link_inertias
-from batchpid.sim.description.tables import Body, Joint
+from batchpid.sim.description.tables import Joint
 from batchpid.sim.diagnosis.causes import table
 from batchpid.sim.findings import summary
-from batchpid.sim.geometry.shapes import DENSITY
 from batchpid.sim.options.groups import DEFAULT_ENGINE
-from batchpid.sim.robot.robot_options import tuned_file
-from batchpid.sim.tuning.gain_sets import GainSet, gain_set, gain_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -53,15 +49,10 @@ NO_GROUND = "No ground: links other than the fixed base reach it at the start po
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """Findings about a robot and gains."""
+    """Findings about a robot."""
 
     robot: Robot
     findings: list[Finding]
-    gains: GainSet | None
-    """Gains that are checked, if any."""
-    of_gains: list[Finding]
-    """Findings about the gains."""
-    all: bool
 
     def report(self) -> str:
         """Return the findings, and tables of joints and links."""
@@ -69,92 +60,34 @@ class Inspection:
         links = robot.tables.bodies
         inertias = link_inertias(robot.tables)
         total = sum(inertia.mass for inertia in inertias.values())
-        size = f"{robot.dof} degrees of freedom, {len(links)} links, {total:.4g} kg"
-        lines = [
-            f"{robot.path}: {size}\n",
-            *(sentences(self.findings) or ["Nothing odd about it."]),
-        ]
-        if self.gains is not None:
-            lines += [
-                f"\nUnder gains {self.gains.name}:",
-                *(sentences(self.of_gains) or ["Nothing odd."]),
-                "\n" + gain_table(robot, self.gains.params),
-            ]
-
         # Joints in the order of qpos, then links by mass: the data sheet has both.
-        joints = list(robot.joints)
-        if self.all:
-            joints += [joint for joint in robot.tables.joints if not joint.moves]
-        rows = [joint_row(number, joint) for number, joint in enumerate(joints)]
-        lines.append("\n" + table(rows, JOINT_COLUMNS, "lllrrrrrl"))
-        rows = []
+        joints = [joint_row(number, joint) for number, joint in enumerate(robot.joints)]
+        masses = []
         for link in links:
             inertia = inertias.get(link.name)
-            mass = "none" if inertia is None else f"{inertia.mass:.4g} kg"
-            rows.append([link.name, mass, self._origin_of_mass(link)])
-        lines.append("\n" + table(rows, ("link", "mass", "from"), "lrl"))
-        lines += ["", *self._contact_lines()]
-        return "\n".join(lines)
-
-    def _origin_of_mass(self, link: Body) -> str:
-        """Return where the mass of a link is from."""
-        repaired = {repair.link for repair in self.robot.repairs if repair.code == "inertia"}
-        if link.mass:
-            return "<inertial>, repaired" if link.name in repaired else "<inertial>"
-        if self.robot.tables.shapes_of(link.name):
-            return f"collision shapes at {DENSITY:g} kg/m^3"
-        return "-"
-
-    def _contact_lines(self) -> list[str]:
-        """Return lines about the ground, and about the pairs of links that do not collide."""
-        robot = self.robot
+            masses.append([link.name, "none" if inertia is None else f"{inertia.mass:.4g} kg"])
         pairs = robot.self_contact.pairs
-        if robot.has_ground:
-            ground = "Ground at height 0."
-        else:
-            ground = NO_GROUND
-        if not pairs:
-            return [_fill(f"{ground} All links collide.")]
         reasons = Counter(pair.reason for pair in pairs)
         counts = ", ".join(f"{count} {reason!r}" for reason, count in reasons.items())
-        more = "" if self.all else " (--all)"
-        lines = [f"{ground} {len(pairs)} pairs of links excluded from collision: {counts}{more}."]
-        if self.all:
-            for reason in reasons:
-                names = [f"{pair.first} - {pair.second}" for pair in pairs if pair.reason == reason]
-                lines.append(f"Do not collide, {reason!r}: {', '.join(names)}")
-        return [_fill(line) for line in lines]
+        lines = [
+            f"{robot.path}: {robot.dof} degrees of freedom, {len(links)} links, {total:.4g} kg\n",
+            *(map(_fill, summary(self.findings)) if self.findings else ["Nothing odd about it."]),
+            "\n" + table(joints, JOINT_COLUMNS, "lllrrrrrl"),
+            "\n" + table(masses, ("link", "mass"), "lr") + "\n",
+            f"{'Ground at height 0.' if robot.has_ground else NO_GROUND} {len(pairs)} pairs of links"
+            f" excluded from collision{counts and f': {counts}'}.",
+        ]
+        return "\n".join(lines)
 
 
-def inspect_robot(
-    robot: Robot,
-    gains: Gains = None,
-    all: Annotated[
-        bool, flag("List fixed joints and pairs of links that do not collide, too.")
-    ] = False,
-) -> Inspection:
-    """List findings about a robot and gains, its joints in the order of qpos, and the masses of its
-    links.
-    """
-    findings = robot.check(setpoint=robot.target, control="drive")  # without gains
-    if gains is None and tuned_file(robot) is None:
-        # Designed gains keep the stability bound.
-        return Inspection(robot, findings, None, [], all)
-    chosen = gain_set(robot, gains)
-    checked = robot.check(
-        params=chosen.params,
-        setpoint=robot.target,
-        control=chosen.control,
-    )
-    of_gains = [finding for finding in checked if finding not in findings]
-    return Inspection(robot, findings, chosen, of_gains, all)
+def inspect_robot(robot: Robot) -> Inspection:
+    """List findings about a robot, its joints in the order of qpos, and the masses of its links."""
+    # A drive has no gains to check.
+    return Inspection(robot, robot.check(setpoint=robot.target, control="drive"))
 
 
 def joint_row(number: int, joint: Joint) -> list[str]:
     """Return the cells of a joint under :data:`JOINT_COLUMNS`; ``number`` is that of its qpos."""
-    links = f"{joint.parent_link} > {joint.child_link}"
-    if not joint.moves:
-        return ["-", joint.name, joint.type, *"-----", links]
     limits = "none"
     if math.isfinite(joint.lower) or math.isfinite(joint.upper):
         limits = f"{_bound(joint.lower)} to {_bound(joint.upper, f' {joint.unit}')}"
@@ -167,17 +100,12 @@ def joint_row(number: int, joint: Joint) -> list[str]:
         _bound(joint.velocity_limit, f" {joint.unit}/s"),
         f"{joint.damping:g}",
         f"{joint.friction:g}",
-        links,
+        f"{joint.parent_link} > {joint.child_link}",
     ]
 
 
 def _bound(value: float, unit: str = "") -> str:
     return f"{value:.5g}{unit}" if math.isfinite(value) else "none"
-
-
-def sentences(findings: Iterable[Finding]) -> list[str]:
-    """Return one sentence for each cause, in lines."""
-    return [_fill(sentence) for sentence in summary(findings)]
 
 
 def _fill(text: str) -> str:
