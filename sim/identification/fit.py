@@ -245,7 +245,8 @@ def bounded_step(
     ridge = np.diag(np.sqrt(damping) * np.linalg.norm(slopes, axis=0))
     rows = np.vstack([slopes, ridge])
     target = -np.append(residual, np.zeros(len(ridge)))
-    step = optimize.lsq_linear(rows, target, (low, high), method="bvls").x
+    # The solution may lie beyond a bound by its last bit.
+    step = np.clip(optimize.lsq_linear(rows, target, (low, high), method="bvls").x, low, high)
     decrease = target @ target - ((rows @ step - target) ** 2).sum()
     return step, 0.5 * float(decrease)
 
@@ -403,7 +404,7 @@ def _with_effect(result: Fit, solver: partial[Fit]) -> Fit:
     zero = np.zeros(len(unknowns.joints))
     kinds = [kind for effect in effects for kind in kinds_of(effect)]
     wider = unknowns.adding(kinds, {"load_friction": zero, "static": zero})
-    wide = replace(problem.coarse(judged=True), unknowns=wider)
+    wide = replace(problem.coarse(), unknowns=wider)
     count = len(present)
     point = np.append(result.point, wider.start[count:])
     changes = inward(point, FIRST_CHANGE * np.eye(len(point)), *wider.bounds)
