@@ -2,16 +2,14 @@ r"""Figures of merit of step responses, as in the control literature, batched ov
 
 With setpoint r, start y0, move A = r - y0 and error e = r - y, per env and joint::
 
-    rise time            from the first 10 % of the move to the first 90 %
     overshoot            max((y - r) sign A) / |A|, at least 0
     settling time        from which on |e| <= max(2 % |A|, absolute band)
     steady-state error   max |e| over the last tenth of the record
-    IAE, ITAE            int |e| dt, int t |e| dt
-    effort peak          max |u|
+    ITAE                 int t |e| dt
     effort variation     sum |u_k - u_{k-1}|: chatter of the actuator
     saturation share     of the samples
 
-Rise time, overshoot and settling time as in K. J. Astrom and R. M. Murray, Feedback Systems
+Overshoot and settling time as in K. J. Astrom and R. M. Murray, Feedback Systems
 (Princeton, 2nd ed.), section 6.3; ITAE after D. Graham and R. C. Lathrop, "The synthesis of optimum
 transient response", Trans. AIEE 72 (1953); total variation of the effort after S. Skogestad,
 "Simple analytic rules for model reduction and PID controller tuning", J. Process Control 13 (2003).
@@ -40,12 +38,10 @@ class StepMetrics(NamedTuple):
     """Figures of merit of a step response, each (envs, joints); lower is better.
 
     A time that is not reached, and every figure of a joint that was not finite throughout, is inf.
-    An undefined figure (rise time and overshoot of a joint that hardly moves, effort figures
-    without efforts) is NaN.
+    An undefined figure (overshoot of a joint that hardly moves, effort figures without efforts) is
+    NaN.
     """
 
-    rise_time: Float64
-    """From 10 % to 90 % of the move [s]."""
     overshoot: Float64
     """Largest excursion beyond the setpoint, as a fraction of the move."""
     settling_time: Float64
@@ -54,25 +50,15 @@ class StepMetrics(NamedTuple):
     """Largest absolute error over the last tenth of the record [rad or m]."""
     peak_deviation: Float64
     """Largest distance beyond the setpoint, defined without a move too [rad or m]."""
-    iae: Float64
-    """Integral of the absolute error [rad s or m s]."""
     itae: Float64
     """Integral of time times the absolute error [rad s^2 or m s^2]."""
-    effort_peak: Float64
-    """Largest absolute effort [N m or N]."""
     effort_variation: Float64
     """Total variation of the effort [N m or N], which is large where it chatters."""
     saturation_share: Float64
     """Share of samples in saturation."""
 
     def __repr__(self) -> str:
-        return array_summary(self, "envs", "joints")
-
-    def worst(self) -> StepMetrics:
-        """Return the worst case over envs, (joints,); undefined figures (NaN) are left out where
-        another env has one.
-        """
-        return StepMetrics(*map(np.fmax.reduce, self))
+        return array_summary(self)
 
 
 @np.errstate(divide="ignore", invalid="ignore")
@@ -96,7 +82,7 @@ def step_metrics(
         before it.
     setpoint
         (joints,), (envs, joints) or (ticks, envs, joints) [rad or m]; the last row is where the
-        move ends, the errors of IAE and ITAE are to each row's own.
+        move ends, the errors of ITAE are to each row's own.
     measurement
         (ticks, envs, joints) [rad or m].
     start
@@ -104,9 +90,8 @@ def step_metrics(
     effort, saturated
         (ticks, envs, joints): applied efforts [N m or N], and whether they were limited.
     absolute_band
-        Least half width of the settling band [rad or m], a number or (joints,). Rise time and
-        overshoot are undefined for moves smaller than 50 times that, where they would compare noise
-        with noise.
+        Least half width of the settling band [rad or m], a number or (joints,). The overshoot is
+        undefined for moves smaller than 50 times that, where it would compare noise with noise.
     continuous
         (joints,) bool: positions that are angles modulo 2 pi; the move is the short way round.
 
@@ -148,8 +133,7 @@ def step_metrics(
     error = r - y
     final_error = r[-1] - y
     tolerance: Float64 = np.maximum(SETTLING_SHARE * size, floor)
-    # For a joint that hardly moves, rise and overshoot would measure noise; its deviation is still
-    # reported.
+    # For a joint that hardly moves, overshoot would measure noise; its deviation is still reported.
     moves = size >= floor / SETTLING_SHARE
     beyond = np.where(
         moves,
@@ -157,23 +141,17 @@ def step_metrics(
         np.max(np.abs(final_error), 0),
     )
     beyond = np.maximum(beyond, 0.0)
-    progress = 1.0 - final_error / move
     overshoot = np.where(moves, beyond / size, np.nan)
-    high = _first_crossing(t, progress, 0.9)
-    low = _first_crossing(t, progress, 0.1)
-    rise = high - np.where(np.isfinite(high), low, 0.0)
     tail_rows = max(1, round(FINAL_SHARE * len(t)))
 
     def judged(figure: ArrayLike) -> Float64:
         return np.where(finite, figure, np.inf)
 
     return StepMetrics(
-        rise_time=judged(np.where(moves, rise, np.nan)),
         overshoot=judged(overshoot),
         settling_time=judged(_settling_time(t, final_error, tolerance)),
         steady_state_error=judged(np.abs(error[-tail_rows:]).max(0)),
         peak_deviation=judged(beyond),
-        iae=judged(np.trapezoid(np.abs(error), t, axis=0)),
         itae=judged(
             np.trapezoid(
                 t[:, None, None] * np.abs(error),
@@ -181,29 +159,12 @@ def step_metrics(
                 axis=0,
             )
         ),
-        effort_peak=np.where(is_sound, np.abs(u).max(0), np.inf),
         effort_variation=np.where(
             is_sound,
             np.abs(np.diff(u, axis=0)).sum(0),
             np.inf,
         ),
         saturation_share=np.mean(limited, axis=0),
-    )
-
-
-def _first_crossing(t: Float64, progress: Float64, level: float) -> Float64:
-    """Return when ``progress`` (ticks, envs, joints) first reaches ``level``, between samples by a
-    line; else inf.
-    """
-    reached = progress >= level
-    k = np.maximum(np.argmax(reached, 0), 1)
-    before = _row(progress, k - 1)
-    after = _row(progress, k)
-    share = np.clip((level - before) / (after - before), 0.0, 1.0)
-    return np.where(
-        reached.any(0),
-        t[k - 1] + share * (t[k] - t[k - 1]),
-        np.inf,
     )
 
 

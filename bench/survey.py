@@ -41,7 +41,7 @@ def survey(path: Path, engine: str, count: int) -> list[str]:
     """Return the row of one robot."""
     row = [path.name, *["-"] * 4]
     try:
-        robot = Robot.load(path, missing_meshes="skip")
+        robot = Robot.load(path)
         row[1] = str(robot.dof)
         params = robot.designed()
         codes = {finding.code for finding in robot.check(params=params)}

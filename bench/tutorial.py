@@ -8,7 +8,6 @@ Runner does not use this module.
 
 from __future__ import annotations
 
-import re
 import tempfile
 from typing import Any
 
@@ -60,7 +59,7 @@ class TutorialLoop:
         loader.fix_root_link = True
         with tempfile.NamedTemporaryFile("w", suffix=".urdf") as file:
             # Without visuals, which need a render device.
-            file.write(re.sub(r"<visual>.*?</visual>", "", to_urdf(robot).text, flags=re.DOTALL))
+            file.write(to_urdf(robot).text)
             file.flush()
             self.robot: Any = loader.load(file.name)
         self._gains = (

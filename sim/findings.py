@@ -36,8 +36,7 @@ OF_FILES = (
          "the first `<robot>`; a default namespace (`xmlns=`) is ignored. `${...}` or `$(...)` in an attribute is an"
          " error: the file was never expanded"),
     FindingKind("unknown-element", "note",
-         "elements and attributes that no URDF has, or that have no effect here; in an MJCF file sites, sensors,"
-         " cameras, sleep, and keyframes other than \"home\"",
+         "elements and attributes that no URDF has, or that have no effect here",
          "without them"),
     FindingKind("repeated", "warning",
          "names used twice or missing; several `<limit>`, `<origin>`, `<inertial>`, ... of one element, or shapes of"
@@ -65,7 +64,7 @@ OF_FILES = (
          "without the shape; the convex hull of the mesh collides"),
     FindingKind("missing-mesh", "warning",
          "a mesh that is not there or cannot be read",
-         "without the shape; `missing_meshes=\"error\"` refuses"),
+         "without the shape"),
     FindingKind("self-collision", "warning",
          "a pair in the .srdf that does not name two links of the robot",
          "without the pair"),
@@ -104,9 +103,6 @@ OF_ROBOTS = (
     FindingKind("no-effort-limit", "note",
          "no effort limit: designed and tuned gains use limits from gravity and inertia",
          "give <limit effort=>, or pass effort_limit= to robot.params()"),
-    FindingKind("continuous", "warning",
-         "the joint is continuous in the file or in params alone",
-         "use robot.params(), or give make_params the continuous= of the file"),
     FindingKind("unstable", "warning",
          "the gains are near the stability bound of the sampled PID loop, or beyond it",
          "lower the gains, or use robot.designed()"),
@@ -116,9 +112,6 @@ OF_RUNS = (
     FindingKind("failed", "warning",
          "an input was not finite, or the state diverged",
          "correct the input or lower the gains"),
-    FindingKind("out-of-reach", "warning",
-         "no pose within the joint limits brings the tool to the setpoint",
-         "move it nearer"),
     FindingKind("guard", "warning",
          "the guard holds the setpoint back",
          "move it inside the guard's limits, or give it more time"),

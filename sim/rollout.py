@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Document, Float64, Rows
+from batchpid.arrays.array_types import Float64, Rows
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import PIDParams
 from batchpid.motors import Actuators
@@ -33,16 +33,16 @@ if TYPE_CHECKING:
 RECORDED = {
     "setpoint": Quantity(np.float64, "setpoint", "rad|m"),
     "feedforward": Quantity(np.float64, "effort added before saturation", "N m|N"),
-    "changes": Quantity(np.uint8, "reset 1, restore 2, params 4, actuators 8", columns={}),
+    "changes": Quantity(np.uint8, "reset 1, restore 2, params 4", columns={}),
 } | QUANTITIES
 """Quantity of each array of a :class:`Rollout`, ``time`` aside."""
 OPTIONAL = ("feedforward", "changes")
 """Arrays of a :class:`Rollout` that may be None."""
 
 
-RESET, RESTORE, PARAMS, ACTUATORS = 1, 2, 4, 8
-"""Bits of :attr:`Rollout.changes`: the envs were reset, a snapshot was restored, params or
-actuators were assigned.
+RESET, RESTORE, PARAMS = 1, 2, 4
+"""Bits of :attr:`Rollout.changes`: the envs were reset, a snapshot was restored, params were
+assigned.
 """
 _OF_ROBOT = (
     "joint_names",
@@ -125,12 +125,10 @@ class RunInfo:
     """Versions of the packages that results depend on, by name."""
     begun: str | None = None
     """Local date and time of the start, ISO 8601."""
-    complete: bool = True
-    """False for a recording that was cut short, or is still being written."""
     faults: tuple[Any, ...] = ()
     """Faults (:class:`batchpid.sim.Fault`) of the runner up to the end of the run."""
-    randomization: Document | None = None
-    """Distributions, as :meth:`batchpid.sim.Randomization.to_dict` returns them."""
+    randomization: str | None = None
+    """Text of the :class:`batchpid.sim.Randomization`."""
     draws: Mapping[str, Float64] | None = None
     """Draws at the start, by field: (envs, joints or links)."""
     episodes: NDArray[np.int64] | None = None

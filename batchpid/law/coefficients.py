@@ -102,7 +102,7 @@ class Coefficients(NamedTuple):
     """
 
     def __repr__(self) -> str:
-        return array_summary(self, "envs", "joints")
+        return array_summary(self)
 
 
 def discretise(params: PIDParams, dt: Array, num_envs: int | None = None) -> Coefficients:

@@ -1,13 +1,14 @@
 """Actuators and sensors between the controller and the joints: delay, lag, envelope, strength,
 resolution.
 
-Build parameters with :func:`make_actuators`; thread a state through :func:`deliver` and
-:func:`measure`::
+Build parameters with :func:`make_actuators`; thread a state through :func:`advance_measurement` and
+:func:`advance_effort`::
 
     actuators = bp.make_actuators(joints=7, command_delay=0.005, strength=0.9)
     state = bp.motors.init(actuators, qpos, dt)
-    state, measured, rate = bp.motors.measure(actuators, state, qpos, qvel, dt)
-    state, effort = bp.motors.deliver(actuators, state, effort, qpos, qvel, dt)
+    k = bp.motors.discretise(actuators, state, dt)
+    state, measured, rate = bp.motors.advance_measurement(k, state, qpos, qvel)
+    state, effort = bp.motors.advance_effort(k, state, effort, qvel)
 
 See docs/actuators.md.
 """
@@ -18,10 +19,8 @@ from batchpid.motors.actuator_dynamics import (
     advance_effort,
     advance_measurement,
     command_limits,
-    deliver,
     discretise,
     init,
-    measure,
     measurement_noise,
 )
 from batchpid.motors.actuators import (
@@ -48,14 +47,12 @@ __all__ = [
     "advance_effort",
     "advance_measurement",
     "command_limits",
-    "deliver",
     "discretise",
     "dumps_actuators",
     "init",
     "load_actuators",
     "loads_actuators",
     "make_actuators",
-    "measure",
     "measurement_noise",
     "reset",
     "save_actuators",

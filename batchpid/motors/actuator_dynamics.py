@@ -8,7 +8,7 @@ velocity v, and the effort u that the controller asks for::
     x      = q + min(max(x' - q, -B/2), B/2)               backlash: the sensor is dragged along
     v_x    = v, 0 within the play
     y, v_y = x(t - d_s), v_x(t - d_s)                      sensor delay
-    y      = r rint((y + o + sigma z) / r)                 offset, noise, resolution; of v_y likewise
+    y      = r rint((y + o + sigma z) / r)                 offset, noise, resolution; of v_y noise alone
 
     m      = s u(t - d_c) + b                              command delay, strength, bias
     e      = min(max(m, low(v)), high(v))                  envelope: batchpid.motors.actuators
@@ -82,7 +82,6 @@ class MotorCoefficients(NamedTuple):
     position_offset: Array = None
     """o."""
     position_resolution: Array = None
-    velocity_resolution: Array = None
     position_noise: Array = None
     velocity_noise: Array = None
     turns: Array = None
@@ -174,7 +173,7 @@ def discretise(
     num_envs: int | None = None,
 ) -> MotorCoefficients:
     """Return the coefficients at ``dt`` [s], for :func:`advance_effort` and
-    :func:`advance_measurement`.
+    :func:`advance_measurement`; those of arrays (joints,) are of ``actuators.for_rank(1)``.
 
     With ``num_envs`` each is spread to (num_envs, joints), which lets NumPy step small batches
     faster. Raises InvalidArgumentError if dt is a number that is not positive, or above 1 s.
@@ -200,7 +199,6 @@ def discretise(
         play=None if a.backlash is None else 0.5 * a.backlash,
         position_offset=a.position_offset,
         position_resolution=_step(a.position_resolution, xp),
-        velocity_resolution=_step(a.velocity_resolution, xp),
         position_noise=a.position_noise,
         velocity_noise=a.velocity_noise,
         turns=None if a.continuous is None else a.continuous / TURN,
@@ -213,42 +211,6 @@ def discretise(
 
     wide: MotorCoefficients = mapped(spread, k)
     return wide
-
-
-def deliver(
-    actuators: Actuators,
-    state: ActuatorState,
-    effort: Array,
-    qpos: Array,
-    qvel: Array,
-    dt: Array,
-) -> tuple[ActuatorState, Array]:
-    """Advance the motors by ``dt`` seconds; return ``(state, effort)``, the effort delivered [N m
-    or N].
-
-    ``effort`` is that asked for [N m or N], ``qpos`` and ``qvel`` are the joints' true positions
-    [rad or m] and velocities, all (envs, joints) or (joints,); none is written to.
-    """
-    inputs = in_dtype_of(actuators, effort, qpos, qvel)
-    actuators = actuators.for_rank(inputs[0].ndim)
-    return advance_effort(discretise(actuators, state, dt), state, *inputs)
-
-
-def measure(
-    actuators: Actuators,
-    state: ActuatorState,
-    qpos: Array,
-    qvel: Array,
-    dt: Array,
-) -> tuple[ActuatorState, Array, Array]:
-    """Advance the sensors by ``dt`` seconds; return ``(state, qpos, qvel)`` as measured.
-
-    ``qpos`` and ``qvel`` are the true positions [rad or m] and velocities (envs, joints) or
-    (joints,); none is written to.
-    """
-    qpos, qvel = in_dtype_of(actuators, qpos, qvel)
-    actuators = actuators.for_rank(qpos.ndim)
-    return advance_measurement(discretise(actuators, state, dt), state, qpos, qvel)
 
 
 def _motor(k: MotorCoefficients, effort: Array) -> Array:
@@ -275,13 +237,15 @@ def advance_effort(
     k: MotorCoefficients,
     state: ActuatorState,
     effort: Array,
-    qpos: Array,
     qvel: Array,
 ) -> tuple[ActuatorState, Array]:
-    """Advance the motors with given coefficients, for loops with constant actuators; otherwise as
-    :func:`deliver`.
+    """Advance the motors by a time step; return ``(state, effort)``, the effort delivered [N m or
+    N].
+
+    ``effort`` is that asked for [N m or N], ``qvel`` the joints' true velocities, both (envs,
+    joints) or (joints,); none is written to.
     """
-    xp = namespace(effort, qpos, qvel)
+    xp = namespace(effort, qvel)
     # Delay, motor, envelope and lag, in the order in which a command passes them.
     command, behind = state.command, state.effort
     if k.command is not None:
@@ -302,10 +266,10 @@ def advance_measurement(
     qvel: Array,
     drawn: tuple[Array, Array] | None = None,
 ) -> tuple[ActuatorState, Array, Array]:
-    """Advance the sensors with given coefficients, for loops with constant actuators; otherwise as
-    :func:`measure`.
+    """Advance the sensors by a time step; return ``(state, qpos, qvel)`` as measured.
 
-    ``drawn`` is the :func:`measurement_noise` at ``state.step``, if it is known already.
+    ``qpos`` and ``qvel`` are the true positions [rad or m] and velocities (envs, joints) or
+    (joints,); none is written to. ``drawn`` is the :func:`measurement_noise` at ``state.step``, if it is known already.
     """
     xp = namespace(qpos, qvel)
     command, effort, positions, velocities, encoder, key, step = state
@@ -334,8 +298,6 @@ def advance_measurement(
     # Resolution comes last: noise and offset are rounded, as in an encoder.
     if k.position_resolution is not None:
         qpos = xp.rint(qpos / k.position_resolution) * k.position_resolution
-    if k.velocity_resolution is not None:
-        qvel = xp.rint(qvel / k.velocity_resolution) * k.velocity_resolution
     state = ActuatorState(command, effort, positions, velocities, encoder, key, step)
     return state, qpos, qvel
 

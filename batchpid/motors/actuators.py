@@ -66,7 +66,6 @@ class _ActuatorsFields(NamedTuple):
     position_offset: Annotated[Array, Field("rad or m", low=-math.inf, group="sensor")] = None
     backlash: Annotated[Array, Field("rad or m", group="sensor")] = None
     position_resolution: Annotated[Array, Field("rad or m", group="sensor")] = None
-    velocity_resolution: Annotated[Array, Field("rad/s or m/s", group="sensor")] = None
     position_noise: Annotated[Array, Field("rad or m", group="sensor")] = None
     velocity_noise: Annotated[Array, Field("rad/s or m/s", group="sensor")] = None
     continuous: Array = None
@@ -163,7 +162,7 @@ class Actuators(Record, _ActuatorsFields):
         return make_actuators(**{"joints": self.num_joints, **present, **options})
 
     def __repr__(self) -> str:
-        return array_summary(self._replace(seed=None), "envs", "joints")
+        return array_summary(self._replace(seed=None))
 
 
 @with_fields(*ACTUATOR_FIELDS)
@@ -219,8 +218,8 @@ def make_actuators(
         Error of the encoder's zero, added to measured positions [rad or m].
     backlash
         Play >= 0 between the joint and its sensor, from one end to the other [rad or m].
-    position_resolution, velocity_resolution
-        Step >= 0 of measured positions [rad or m] and velocities [rad/s or m/s].
+    position_resolution
+        Step >= 0 of measured positions [rad or m].
     position_noise, velocity_noise
         Standard deviation >= 0 of the Gaussian noise of each sample [rad or m, and per second].
     seed
@@ -333,7 +332,7 @@ class ActuatorState(Record, _ActuatorStateFields):
     NAME = "state"
 
     def __repr__(self) -> str:
-        return array_summary(self._replace(key=None, step=None), "envs", "joints")
+        return array_summary(self._replace(key=None, step=None))
 
     def matched_to(self, fresh: ActuatorState) -> ActuatorState:
         """Return this state with exactly the leaves of ``fresh``: missing ones from there, the

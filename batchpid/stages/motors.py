@@ -58,6 +58,6 @@ class Motors(Stage):
         return model.init(self.actuators, qpos, self.timestep, qvel=qvel, effort=holding), values
 
     def step(self, state: ActuatorState, values: Values) -> Told:
-        qpos, qvel, _ = values.measured
-        state, effort = model.advance_effort(self.k, state, values.outputs.qf, qpos, qvel)
+        inputs = values.outputs.qf, values.measured.qvel
+        state, effort = model.advance_effort(self.k, state, *inputs)
         return state, values.told(qf=effort, motor=effort)

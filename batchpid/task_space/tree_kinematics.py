@@ -58,24 +58,17 @@ def prepared(tree: RigidTree, **arrays: Array) -> tuple[list[Array], Bodies, Arr
     """
     instance("tree", tree, RigidTree, MAKE_TREE)
     xp = namespace(*arrays.values())
-    checked = []
-    shape = None
+    checked: list[Array] = []
     for name, value in arrays.items():
-        if xp is not np or is_traced(value):
-            array = value
-        else:
+        array = value
+        if xp is np and not is_traced(value):
             array = read_array(name, value).astype(np.float64, copy=False)
-        if array.ndim < 1 or array.shape[-1] != tree.dof:
+        # All are for the same envs.
+        like = checked[0] if checked else array
+        shape = (*like.shape[:-1], tree.dof)
+        if array.shape != shape:
             remedy = f"the last axis counts the joints {', '.join(tree.joint_names)}"
-            raise InvalidArgumentError(
-                name, f"has shape {array.shape}, not (..., {tree.dof})", remedy=remedy
-            )
-        if shape is not None and array.shape != shape:
-            remedy = "give both for the same envs"
-            raise InvalidArgumentError(
-                name, f"has shape {array.shape}, but the first has {shape}", remedy=remedy
-            )
-        shape = array.shape
+            raise InvalidArgumentError(name, f"has shape {array.shape}, not {shape}", remedy=remedy)
         checked.append(array)
     if xp is np:
         return checked, tree.bodies, xp
@@ -233,13 +226,9 @@ def read_point(like: Array, point: Array) -> Array:
     if point is None:
         return None
     xp = namespace(like, point)
-    if xp is np:
-        at = read_array("point", point).astype(np.float64, copy=False)
-    else:
-        at = xp.asarray(point, like.dtype)
-    shapes = dict.fromkeys([(3,), (*like.shape[:-1], 3)])
-    if at.shape not in shapes:
-        problem = f"has shape {at.shape}, not {' or '.join(map(str, shapes))}"
+    at = xp.asarray(read_array("point", point, traced=True), like.dtype)
+    if at.shape not in ((3,), (*like.shape[:-1], 3)):
+        problem = f"has shape {at.shape}, not (3,) or {(*like.shape[:-1], 3)}"
         raise InvalidArgumentError("point", problem, remedy="give x, y, z in the link's frame [m]")
     return at
 

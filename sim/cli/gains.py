@@ -4,9 +4,7 @@ robot itself, as a file for another program.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -33,8 +31,6 @@ ENDINGS = {
     "urdf": ".urdf",
 }
 """Suffix of the file of each target."""
-COMMENTS = {"c": "/* {} */", "mjcf": "<!-- {} -->", "urdf": "<!-- {} -->"}
-"""Comment of a target's language; of the others "# {}"."""
 
 
 def tune(
@@ -101,28 +97,19 @@ class ExportedFile:
     """File for a target, with its differences from batchpid's law or the robot's file."""
 
     target: str
-    make: Callable[[Path], Exported]
-    """Function of the file's folder."""
+    exported: Exported
 
     def report(self) -> str:
         """Return a line for each difference."""
-        # The folder decides only how meshes are named.
-        differences = self.make(Path.cwd()).differences
+        differences = self.exported.differences
         if not differences:
             return "The file has no differences."
         return "\n".join(f"differs: {text}" for text in differences)
 
     def save(self, path: Path) -> None:
-        """Write the file, with a comment at its end for each difference that it does not name."""
+        """Write the file."""
         file_path("out", path, (ENDINGS[self.target],))
-        text, differences = self.make(path.absolute().parent)
-        comment = COMMENTS.get(self.target, "# {}")
-        for difference in differences:
-            # Two hyphens would end a comment of XML, and */ one of C.
-            sentence = " ".join(difference.split()).replace("--", "- -").replace("*/", "* /")
-            if sentence not in text:
-                text += comment.format(f"differs: {sentence}") + "\n"
-        write_atomically(path, text)
+        write_atomically(path, self.exported.text)
 
 
 def export(
@@ -153,10 +140,9 @@ def export(
             raise InvalidArgumentError("gains", problem, value=gains, remedy="leave it out")
         from batchpid.sim.robot.urdf_export import to_urdf
 
-        return ExportedFile(to, partial(to_urdf, robot))
+        return ExportedFile(to, to_urdf(robot))
     if to == "mjcf":
-        exported = _mjcf(robot, gains, timestep)
-        return ExportedFile(to, lambda folder: exported)
+        return ExportedFile(to, _mjcf(robot, gains, timestep))
     # The law: its joints are all of them in C, and the leaders alone in ros2_control.
     from batchpid.export import to_c, to_ros2_control
 
@@ -183,7 +169,7 @@ def export(
     if not leaders.all():
         text = f"{', '.join(names[~leaders])}: followers are {place}"
         exported = exported._replace(differences=(*exported.differences, text))
-    return ExportedFile(to, lambda folder: exported)
+    return ExportedFile(to, exported)
 
 
 def law_gains(robot: Robot, gains: str | None) -> bp.PIDParams:

@@ -2,12 +2,10 @@
 pose.
 
 Geoms that add neither shape nor mass are not compiled, so their meshes and textures may be missing.
-A collision mesh may be missing if the mass of its body does not depend on it.
 """
 
 from __future__ import annotations
 
-import math
 import sys
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,7 +25,7 @@ from batchpid.sim.description.mjcf_bodies import (
     excluded_pairs,
     label,
 )
-from batchpid.sim.description.mjcf_motors import read_couplings, read_motors
+from batchpid.sim.description.mjcf_motors import Couplings, read_couplings, read_motors
 from batchpid.sim.description.tables import MjcfFile, Source
 from batchpid.sim.findings import Finding
 from batchpid.task_space.rigid_tree import GRAVITY
@@ -62,6 +60,16 @@ _SWITCHES = (
     "CONSTRAINT",
 )
 """Parts of MuJoCo's physics that a file can disable."""
+_OF_TENDONS = (
+    "stiffness",
+    "stiffnesspoly",
+    "damping",
+    "dampingpoly",
+    "frictionloss",
+    "armature",
+    "limited",
+)
+"""Effects of a tendon by itself."""
 
 # Without a handler MuJoCo appends warnings to a file in the working folder, too.
 if mujoco.get_mju_user_warning() is None:
@@ -73,42 +81,26 @@ def read_mjcf(
     name: str,
     findings: list[Finding],
     fixed_base: bool | None,
-    missing_meshes: str,
 ) -> Source:
     """Return the content of the MJCF file at ``path`` as the robot ``name``, with ``findings`` of
     reading the file.
 
     For the other arguments see :meth:`batchpid.sim.Robot.load`. Raises RobotError if MuJoCo refuses
-    the file, it has a ball joint or several robots, or missing meshes are refused.
+    the file, or it has a ball joint or several robots.
     """
     # MuJoCo opens the file by its path, and workers do so again.
     if not path.is_file():
         raise RobotError(f"{path}: an MJCF file is read several times; save it as a file first")
-    try:
-        return _read(path, name, findings, fixed_base, missing_meshes)
-    except UnicodeDecodeError as error:
-        raise RobotError(
-            f"{path}: a name is not UTF-8, which MuJoCo requires: {error}; save it as UTF-8"
-        ) from error
-
-
-def _read(
-    path: Path,
-    name: str,
-    findings: list[Finding],
-    fixed_base: bool | None,
-    missing_meshes: str,
-) -> Source:
-    compiled = compile_file(path, missing_meshes, findings)
+    compiled = compile_scene(path)
     model = compiled.model
     robot = RobotInFile(model, path, findings)
     # A base is free where the file has a free joint, unless the caller fixes it.
     if fixed_base is None:
-        fixed_base = not (robot.base and model.body_jntnum[robot.base])
+        fixed_base = not robot.base
     couplings = read_couplings(robot)
     motors = read_motors(robot, couplings)
     tables = robot.read(couplings, motors, is_held=fixed_base)
-    _report_unused(robot)
+    _report_ignored(robot)
     # The start pose is that of the keyframe, else the reference pose.
     key = home(model)
     pose = model.qpos0 if key is None else model.key_qpos[key]
@@ -136,7 +128,7 @@ def _read(
         column(pose[model.jnt_qposadr]),
         # A file of motors alone has no gains to offer.
         gains if (motors.kp + motors.kd).any() else None,
-        mjcf=_file(path, compiled, robot, fixed_base),
+        mjcf=_file(path, compiled, robot, fixed_base, _lost(robot, couplings, len(tables.shapes))),
         disabled=excluded_pairs(model, robot.solid),
         actuators=actuators if actuators is not None and actuators.num_joints else None,
     )
@@ -152,6 +144,7 @@ def _file(
     compiled: Compiled,
     robot: RobotInFile,
     fixed_base: bool,
+    lost: str,
 ) -> MjcfFile:
     """Return the data of the file that the engine MuJoCo needs."""
     model = compiled.model
@@ -167,46 +160,28 @@ def _file(
         if all(robot.is_of_robot(body) for body in at):
             loops.append(label(model.equality(equality)))
     free = model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE].tolist()
-    planes = np.flatnonzero((model.geom_bodyid == 0) & (model.geom_type == PLANE)).tolist()
-    grounds = [plane for plane in planes if can_collide(model, plane)]
+    planes = (model.geom_bodyid == 0) & (model.geom_type == PLANE)
+    grounds = np.flatnonzero(planes & can_collide(model)).tolist()
     floats = any(robot.is_of_robot(body) for body in free)
     return MjcfFile(
         path=str(path),
-        is_whole=compiled.is_whole,
         content=compiled.content,
         bodies=tuple(robot.bodies.values()),
         falling=tuple(robot.bodies[body] for body in free if not robot.is_of_robot(body)),
         loops=tuple(loops),
-        lost="; ".join(
-            f"{kind} ({', '.join(names)})" for kind, names in robot.lost.items() if names
-        ),
+        lost=lost,
         is_alone=all(robot.is_of_robot(body) for body in model.jnt_bodyid),
         has_floor=bool(grounds) and not (floats and fixed_base),
         friction=float(model.geom_friction[grounds[0], 0]) if grounds else 1.0,
     )
 
 
-def _report_unused(robot: RobotInFile) -> None:
-    """Report content that is not simulated, apart from motors, couplings and shapes."""
+def _report_ignored(robot: RobotInFile) -> None:
+    """Report content that no engine simulates, apart from motors."""
     model, option = robot.model, robot.model.opt
-    counts = {
-        "sites": model.nsite,
-        "sensors": model.nsensor,
-        "cameras": model.ncam,
-        "keyframes": model.nkey - (home(model) is not None),
-        "<flag sleep='enable'>": int(option.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP > 0),
-    }
-    unused = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
-    if unused:
-        text = f"elements that the simulation does not use are left out: {unused}"
-        robot.repairs.append(Finding("unknown-element", text, "expect no effect"))
-    disabled = {
-        switch
-        for switch in (*_SWITCHES, "GRAVITY", "ACTUATION")
-        if option.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{switch}")
-    }
-    # What no engine simulates, then what MuJoCo alone does.
-    ignored = [f"<flag {switch.lower()}>" for switch in sorted(disabled.difference(_SWITCHES))]
+    ignored = [
+        f"<flag {name.lower()}>" for name in ("ACTUATION", "GRAVITY") if _is_off(option, name)
+    ]
     if tuple(option.gravity) != GRAVITY:
         ignored.append("gravity")
     ignored += [
@@ -218,137 +193,75 @@ def _report_unused(robot: RobotInFile) -> None:
         text = f"has no effect, gravity is {GRAVITY} m/s^2: {', '.join(ignored)}"
         remedy = "let the controller compensate, or use Randomization(gravity=...)"
         robot.repairs.append(Finding("option", text, remedy))
-    lost = robot.lost
-    lost["<flag>"] += [switch.lower() for switch in _SWITCHES if switch in disabled]
-    if option.density or option.viscosity:
-        lost["the medium"].append("density, viscosity")
-    if model.nflex:
-        lost["flexible bodies"].append("rigid")
-    if (model.body_plugin >= 0).any():
-        lost["plugins"].append("of bodies")
-    for joint, name in robot.joints.items():
-        if model.jnt_stiffness[joint] or model.jnt_stiffnesspoly[joint].any():
-            lost["springs"].append(repr(name))
-        if model.dof_dampingpoly[model.jnt_dofadr[joint]].any():
-            lost["damping that grows with the speed"].append(repr(name))
+
+
+def _is_off(option: Any, name: str) -> bool:
+    return bool(option.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}"))
+
+
+def _lost(robot: RobotInFile, couplings: Couplings, shapes: int) -> str:
+    """Return the content that is missing in an engine which does not simulate the file, apart from
+    the robot's motors, ``couplings`` and ``shapes``.
+    """
+    model, option = robot.model, robot.model.opt
+    joints = list(robot.joints)
+    dofs = model.jnt_dofadr[joints]
+    # A level plane at height 0 is the ground of the engines.
+    poses = np.column_stack([model.geom_pos[:, 2], model.geom_quat[:, 1:3]])
+    of_world = model.geom_bodyid == 0
+    grounds = of_world & (model.geom_type == PLANE) & ~poses.any(1)
+    of_robot = np.array([robot.is_of_robot(body) for body in model.geom_bodyid], bool)
+    solid = can_collide(model) & (of_robot | of_world) & ~grounds
+    counts: dict[str, Any] = {
+        "bodies apart from the robot": len(robot.left_out),
+        "equality constraints": model.eq_active0.sum() - len(couplings),
+        "tendons": sum(
+            any(np.any(getattr(model, f"tendon_{name}")[tendon]) for name in _OF_TENDONS)
+            for tendon in range(model.ntendon)
+        ),
+        "springs": np.c_[model.jnt_stiffness, model.jnt_stiffnesspoly][joints].any(1).sum(),
+        "dampers that are not linear": model.dof_dampingpoly[dofs].any(1).sum(),
+        "planes, height fields and shapes of the world": solid.sum() - shapes,
+        "flexible bodies": model.nflex,
+        "plugins of bodies": (model.body_plugin >= 0).sum(),
+        "properties of a medium": np.count_nonzero([option.density, option.viscosity]),
+        "disabling <flag>s": sum(_is_off(option, name) for name in _SWITCHES),
+    }
+    return ", ".join(f"{kind} ({count})" for kind, count in counts.items() if count)
 
 
 class Compiled(NamedTuple):
-    """Model of a file, and the ``mujoco.MjSpec`` that was compiled.
-
-    ``is_whole`` says whether it has the geoms that are only drawn, ``missing`` are the files of
-    collision meshes that it is without.
-    """
+    """Model of a file, and the ``mujoco.MjSpec`` that was compiled."""
 
     scene: MjSpec
     model: MjModel
-    is_whole: bool
-    missing: tuple[str, ...]
 
     @property
     def content(self) -> str:
         """Digest of the elements that move, collide or act."""
         model = self.model
         names = [name for name in dir(model) if name.startswith(_PREFIXES)]
-        arrays = {name: _rounded(np.asarray(getattr(model, name), float)) for name in names}
+        # The last bits may differ between kinds of processors.
+        arrays = {name: np.round(np.asarray(getattr(model, name), float), 9) for name in names}
         return digest(arrays, model.names, str(model.opt))
 
 
-def _rounded(values: Float64) -> Float64:
-    """Return ``values`` to nine digits: the last bits may differ between kinds of processors."""
-    # What cancels out leaves a rest of rounding.
-    shares, exponents = np.frexp(np.where(np.abs(values) < 1e-12, 0.0, values))
-    rounded: Float64 = np.ldexp(np.round(shares, 9), exponents)
-    return rounded
-
-
-def compile_file(path: Path, missing_meshes: str, findings: list[Finding]) -> Compiled:
-    """Return the compiled model of a file.
-
-    Raises RobotError if MuJoCo refuses the file, or missing meshes are refused.
-    """
-    lean = None
-    try:
-        lean = compile_scene(path, is_whole=False)
-        if not lean.missing:
-            return lean
-        return compile_scene(path, is_whole=True)
-    except RobotError:
-        # Something may refer to a geom that is only drawn.
-        if lean is None:
-            return compile_scene(path, is_whole=True)
-        if missing_meshes == "error":
-            raise
-    text = f"collision meshes not found, simulated without: {', '.join(lean.missing)}"
-    remedy = "put the files where the MJCF names them"
-    findings.append(Finding("missing-mesh", text, remedy))
-    return lean
-
-
-def compile_scene(path: Path, is_whole: bool) -> Compiled:
-    """Return the compilation of the whole file, or of its collision shapes and masses.
+def compile_scene(path: Path) -> Compiled:
+    """Return the compilation of a file, without elements that are only drawn.
 
     Raises RobotError if MuJoCo refuses it.
     """
-    missing: tuple[str, ...] = ()
     # MuJoCo takes a file of the same name, size and second for the one that it has read.
     mujoco.mj_clearCache(mujoco.mj_getCache())
     try:
         scene = mujoco.MjSpec.from_file(str(path))
-        if not is_whole:
-            missing = _strip(scene, path)
-        return Compiled(scene, scene.compile(), is_whole, missing)
+        scene.compiler.discardvisual = True
+        model = scene.compile()
+        model.names.decode()  # MuJoCo requires UTF-8, and does not check it
+        return Compiled(scene, model)
     except (ValueError, mujoco.FatalError) as error:
         problem = " ".join(str(error).split())
         raise RobotError(
             f"{path}: MuJoCo cannot compile the file: {problem}; correct it, or restore the file"
             " that it names, e.g. by git lfs pull"
         ) from error
-
-
-def _strip(spec: Any, path: Path) -> tuple[str, ...]:
-    """Remove materials, geoms that add neither shape nor mass, and collision shapes of missing
-    meshes; return the files of the latter.
-    """
-    # A <pair> makes geoms collide whatever their masks say.
-    paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
-    absent = {}
-    for mesh in spec.meshes:
-        folder = path.parent / (mesh.compiler.meshdir or "")
-        file = Path(mesh.file).name if spec.strippath else mesh.file
-        if mesh.file and not (folder / file).is_file():
-            absent[mesh.name] = mesh.file
-    missing: dict[str, None] = {}
-    used: set[str] = set()
-    for geom in list(spec.geoms):
-        # A texture that is missing would stop the compilation.
-        geom.material = ""
-        is_solid = geom.contype or geom.conaffinity or geom.name in paired
-        # A missing mesh that weighs stays, and MuJoCo refuses it.
-        if _weighs(spec, geom) or (is_solid and geom.meshname not in absent):
-            used.add(geom.meshname)
-            continue
-        if is_solid:
-            missing[absent[geom.meshname]] = None
-        for pair in list(spec.pairs):
-            if geom.name in (pair.geomname1, pair.geomname2):
-                spec.delete(pair)
-        spec.delete(geom)
-    for site in spec.sites:
-        site.material = ""
-    unused = [mesh for mesh in spec.meshes if mesh.name not in used]
-    for element in [*spec.materials, *spec.textures, *unused]:
-        spec.delete(element)
-    return tuple(missing)
-
-
-def _weighs(spec: Any, geom: Any) -> bool:
-    """Return whether the mass of a geom's body depends on the geom."""
-    body = geom.parent
-    always = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
-    if body.explicitinertial and spec.compiler.inertiafromgeom != always:
-        return False
-    if geom.mass == 0 or (math.isnan(geom.mass) and geom.density == 0):
-        return False
-    low, high = spec.compiler.inertiagrouprange
-    return bool(low <= geom.group <= high) and body.parent is not None

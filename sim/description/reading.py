@@ -8,7 +8,6 @@ import os
 from pathlib import Path
 
 import numpy as np
-from lxml import etree
 
 from batchpid import assets
 from batchpid.arrays.elementwise import read_only
@@ -45,44 +44,27 @@ def find_robot(name_or_path: str | Path) -> Path:
     )
 
 
-def read_robot(
-    path: Path,
-    fixed_base: bool | None,
-    package_dirs: tuple[Path, ...],
-    missing_meshes: str,
-) -> Source:
+def read_robot(path: Path, fixed_base: bool | None, package_dirs: tuple[Path, ...]) -> Source:
     """Return the robot in the URDF or MJCF file at ``path``, without its .srdf.
 
     For the arguments see :meth:`batchpid.sim.Robot.load`. Raises RobotError for a file that cannot
-    be read, a structure or number without repair, a bad mesh, or an MJCF file that MuJoCo does not
-    compile.
+    be read, a structure or number without repair, or an MJCF file that MuJoCo does not compile.
     """
     findings: list[Finding] = []
     root = parse_xml(path, findings)
-    if is_mjcf(root):
+    # MuJoCo ignores a default namespace.
+    if root.tag == "mujoco":
         name = root.get("model") or path.stem
-        source = read_mjcf(path, name, findings, fixed_base, missing_meshes)
+        source = read_mjcf(path, name, findings, fixed_base)
     else:
-        source = read_urdf(
-            root,
-            path,
-            findings,
-            fixed_base,
-            package_dirs,
-            missing_meshes,
-        )
+        source = read_urdf(root, path, findings, fixed_base, package_dirs)
     joints = [joint.name for joint in source.tables.joints]
     for name in (source.name, *joints, *source.tables.links):
         if not is_name(name):
             raise RobotError(
                 f"{path}: the name {name!r} has a control character or a line break; rename it"
             )
-    return source._replace(package_dirs=package_dirs)
-
-
-def is_mjcf(root: etree._Element) -> bool:
-    """Return whether a root element is an MJCF file's; MuJoCo ignores a default namespace."""
-    return root.prefix is None and etree.QName(root).localname == "mujoco"
+    return source
 
 
 def with_srdf(source: Source) -> Source:

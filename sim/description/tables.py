@@ -163,7 +163,7 @@ class Visual(NamedTuple):
     """Shape that is drawn."""
 
     shape: Shape | None
-    """Shape, with the name of its mesh as in the file; None where it cannot be read."""
+    """Shape, with the path of its mesh; None where it cannot be read."""
     rgba: tuple[float, ...] | None = None
     """Colour, None where the file gives none."""
     problem: str | None = None
@@ -177,9 +177,7 @@ class Tables:
     bodies: tuple[Body, ...]
     """Breadth first from the base, siblings in the order of the file."""
     shapes: tuple[Shape, ...]
-    """In the order of the bodies and of the file; after a merge the mirrored shapes of a body are its
-    last.
-    """
+    """In the order of the bodies and of the file."""
     links: Mapping[str, Placement]
     """Body and place in it of each link of the file, in the order of the file's rows."""
     visuals: Mapping[str, tuple[Visual, ...]] = field(default_factory=dict)
@@ -307,18 +305,16 @@ class Settings:
 class MjcfFile:
     """MJCF file that MuJoCo simulates itself, with everything in it besides the robot.
 
-    ``is_whole`` says whether all of it is compiled
-    (:func:`batchpid.sim.description.mjcf.compile_scene`), and ``content`` is the digest of the
-    model. ``bodies`` are the names of all bodies, ``falling`` the names of bodies on free joints
-    other than the robot's. ``loops`` are the equality constraints that close loops of the robot's
-    links. ``lost`` describes the content that is missing in an engine which does not simulate the
-    file. ``is_alone`` is False if more than the robot moves. ``has_floor`` is True if planes of the
-    world can collide, unless the root is fixed to the origin in place of its free joint.
-    ``friction`` is the coefficient of its ground, the first of these planes.
+    ``content`` is the digest of the model. ``bodies`` are the names of all bodies, ``falling`` the
+    names of bodies on free joints other than the robot's. ``loops`` are the equality constraints
+    that close loops of the robot's links. ``lost`` describes the content that is missing in an
+    engine which does not simulate the file. ``is_alone`` is False if more than the robot moves.
+    ``has_floor`` is True if planes of the world can collide, unless the root is fixed to the origin
+    in place of its free joint. ``friction`` is the coefficient of its ground, the first of these
+    planes.
     """
 
     path: str
-    is_whole: bool
     content: str
     bodies: tuple[str, ...]
     falling: tuple[str, ...] = ()
@@ -350,7 +346,5 @@ class Source(NamedTuple):
     """Pairs of links that do not collide, by the file or its .srdf."""
     enabled: frozenset[frozenset[str]] = frozenset()
     """Pairs of links that an .srdf enables."""
-    package_dirs: tuple[Path, ...] = ()
-    """Folders in which meshes are looked up first."""
     self_collision: str = "auto"
     dissipation: str = "urdf"

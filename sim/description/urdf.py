@@ -6,6 +6,7 @@ repaired while it is read, with a finding each; the rest is an error.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from itertools import chain
 from pathlib import Path
@@ -24,7 +25,7 @@ from batchpid.sim.description.urdf_elements import (
 from batchpid.sim.findings import Finding
 
 MOST_READ = 4096  # links and joints of a file
-UNUSED = {"visual", "material", "transmission", "gazebo", "sensor", "ros2_control", "calibration"}
+_UNUSED = {"visual", "material", "transmission", "gazebo", "sensor", "ros2_control", "calibration"}
 """Elements of a URDF without effect on the motion."""
 _ELEMENTS = {
     "robot": {"link", "joint", "transmission"},
@@ -71,11 +72,10 @@ def read_urdf(
     findings: list[Finding],
     fixed_base: bool | None,
     package_dirs: tuple[Path, ...],
-    missing_meshes: str,
 ) -> Source:
     """Return the robot of the root element of a URDF, with ``findings`` of reading the file.
 
-    Raises RobotError for a structure or number without repair, and for a bad mesh.
+    Raises RobotError for a structure or number without repair.
     """
     _check_root(root, path)
     reader = ElementReader(path, package_dirs, findings)
@@ -94,7 +94,7 @@ def read_urdf(
     if fixed_base is None:
         fixed_base = start is None
     tables = _read_tables(links, joints, path, reader)
-    reader.report_missing(missing_meshes)
+    reader.report_missing()
     name = root.get("name", "").strip() or path.stem
     return Source(
         path,
@@ -129,11 +129,12 @@ def _drop_unused(root: etree._Element, findings: list[Finding]) -> None:
         for child in list(parent):
             if child.tag in _ELEMENTS[parent.tag]:
                 continue
-            name = etree.QName(child)
-            if "xacro" in (name.namespace or ""):
-                unknown[f"<xacro:{name.localname}>"] += 1
-            elif name.localname not in UNUSED:
-                unknown[f"<{name.localname}>"] += 1
+            # With the namespace, or a prefix that nobody declared.
+            name = re.split("[:}]", child.tag)[-1]
+            if "xacro" in child.tag:
+                unknown[f"<xacro:{name}>"] += 1
+            elif name not in _UNUSED:
+                unknown[f"<{name}>"] += 1
             parent.remove(child)
     for element in root.iter(*_ATTRIBUTES):
         for key in sorted({*element.attrib} - _ATTRIBUTES[element.tag]):

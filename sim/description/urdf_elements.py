@@ -11,7 +11,6 @@ import numpy as np
 from lxml import etree
 
 from batchpid.arrays.array_types import Document, Float64
-from batchpid.errors import RobotError
 from batchpid.sim.description.tables import (
     MOVING_TYPES,
     NO_TURN,
@@ -79,6 +78,10 @@ class ElementReader:
             rows = []
             for element in link.findall("visual"):
                 shape, problem = _read_shape(element, name)
+                if shape is not None and shape.kind == "mesh":
+                    file = self._find_mesh(shape)
+                    problem = None if file else f"{shape.file!r} not found"
+                    shape = shape._replace(file=str(file)) if file else None
                 material = element.find("material")
                 rgba = None
                 if material is not None:
@@ -268,7 +271,7 @@ class ElementReader:
             self.warn("collision", text, "correct <collision>", link=link)
             return
         if shape.kind == "mesh":
-            file = find_mesh(shape.file, self._path, self._package_dirs)
+            file = self._find_mesh(shape)
             if file is None:
                 self._missing.append(shape.file)
                 return
@@ -279,22 +282,16 @@ class ElementReader:
             shape = shape._replace(file=str(file), content=content)
         self.shapes.append(shape)
 
-    def report_missing(self, missing_meshes: str) -> None:
-        """Report meshes that are missing or cannot be read, or raise RobotError if that is
-        "error".
-        """
-        if not self._missing:
-            return
-        listed = ", ".join(self._missing)
-        remedy = "repair the files, pass package_dirs=[...] with the folder that holds the package"
-        remedy += ", or name it in ROS_PACKAGE_PATH"
-        if missing_meshes == "error":
-            problem = f"collision mesh not found or not readable: {listed}"
-            raise RobotError(
-                f"{self._path}: {problem}; {remedy}, or missing_meshes='skip' to simulate without"
-            )
-        text = f"collision meshes not found or not readable, simulated without: {listed}"
-        self.warn("missing-mesh", text, remedy)
+    def _find_mesh(self, shape: Shape) -> Path | None:
+        return find_mesh(shape.file, self._path, self._package_dirs)
+
+    def report_missing(self) -> None:
+        """Report meshes that are missing or cannot be read."""
+        if self._missing:
+            text = "collision meshes not found or not readable, simulated without: "
+            remedy = "repair the files, pass package_dirs=[...] with the folder that holds the"
+            remedy += " package, or name it in ROS_PACKAGE_PATH"
+            self.warn("missing-mesh", text + ", ".join(self._missing), remedy)
 
 
 def _read_shape(element: etree._Element, link: str) -> tuple[Shape | None, str | None]:

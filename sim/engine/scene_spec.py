@@ -65,12 +65,8 @@ class MujocoSolver:
     """Relative improvement of the cost at which it ends."""
     elliptic: bool = True
     """Whether friction cones are elliptic, not pyramids, which are faster and slip a little."""
-    limit_time: float = 0.0
-    """Time constant of joint limits [s]; at least two sim steps, which are the hardest limits that
-    MuJoCo simulates. An MJCF file gives its own time constants, for contacts too.
-    """
     contact_time: float = 0.005
-    """Time constant of contacts [s], at least two sim steps."""
+    """Time constant of contacts [s], at least two sim steps; an MJCF file gives its own."""
 
 
 SOLVERS = {
@@ -85,10 +81,8 @@ SOLVERS = {
 
 
 Build = Callable[[Any, int], Any]
-"""``build(scene, env)`` adds content to the engine's scene of env ``env``; returns objects whose
-poses are read.
-
-An object is an entity or the name of a link of the robot, merged links included. None: no poses.
+"""``build(scene, env)`` adds actors to the engine's scene of env ``env``; returns those whose poses
+are read, or None.
 """
 
 
@@ -102,7 +96,8 @@ class SceneSpec:
     scenes have no collision shapes and no ground, but the same masses and inertias. ``mjcf`` is the
     file that MuJoCo compiles in place of ``tables``. ``contacts`` and ``wrenches`` are links with
     sensors. ``carrier`` is the link that carries payloads, and ``varied_links`` are those whose mass
-    or center of mass varies. Specs that differ in ``build`` alone are equal.
+    or center of mass varies. With ``drives`` the engine's drives move the joints. Specs that differ
+    in ``build`` alone are equal.
     """
 
     tables: Tables
@@ -121,6 +116,7 @@ class SceneSpec:
     mjcf: MjcfFile | None = None
     carrier: str = ""
     varied_links: tuple[str, ...] = ()
+    drives: bool = False
 
     @property
     def simulated(self) -> Tables:

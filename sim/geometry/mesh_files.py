@@ -1,7 +1,6 @@
 """Mesh files of a URDF: the search for them, their reading, and their content.
 
-SAPIEN silently drops a collision shape whose file it cannot read, and a damaged file of some
-formats ends its process. So trimesh reads every file first.
+trimesh reads the files. Engines get vertices, and read no file themselves.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
-from lxml import etree
 
 from batchpid.arrays.trees import digest
 from batchpid.errors import RobotError
@@ -58,35 +56,21 @@ def find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | N
 
 def _candidates(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Iterator[Path]:
     """Yield the files that ``name`` may mean, the likeliest first."""
-    above = path.absolute().parents
-    if package := re.match(r"(?:package|model):/+([^/]+)/(.+)", name):
-        within = package[2]
-        yield from (folder / package[1] / within for folder in (*package_dirs, *above))
-        yield from (
-            folder / within for folder in (*package_dirs, *above, *_ros_packages(package[1]))
-        )
-        return
-    # A plain path may be relative to any folder above, as in a package.
-    relative = re.sub(r"^file:(//(localhost)?)?", "", name)
-    yield from (folder / relative for folder in (above[0], *package_dirs, *above[1:]))
-
-
-def _ros_packages(package: str) -> Iterator[Path]:
-    """Yield the folders of a ROS package that the environment names: ROS 2 installs, then ROS 1
-    workspaces.
-    """
-    if not re.fullmatch(r"\w[\w.-]*", package):
-        return
-    prefixes, roots = (
+    # ROS 2 installs, then ROS 1 workspaces.
+    prefixes, workspaces = (
         [Path(folder) for folder in os.environ.get(variable, "").split(os.pathsep) if folder]
         for variable in ("AMENT_PREFIX_PATH", "ROS_PACKAGE_PATH")
     )
-    yield from (prefix / "share" / package for prefix in prefixes)
-    for root in roots:
-        if root.name == package:
-            yield root
-        for pattern in (package, f"*/{package}", f"*/*/{package}"):  # rospack searches any depth
-            yield from sorted(root.glob(pattern))
+    shares = [prefix / "share" for prefix in prefixes]
+    folders = (*package_dirs, *path.absolute().parents, *shares, *workspaces)
+    package = re.match(r"(?:package|model):/+([^/]+/(.+))", name)
+    if package is None:
+        # A plain path may be relative to any folder above, as in a package.
+        relative = re.sub(r"^file:(//(localhost)?)?", "", name)
+        yield from (folder / relative for folder in folders)
+    else:
+        for relative in package.groups():
+            yield from (folder / relative for folder in folders)
 
 
 def read_mesh(path: str | Path, data: bytes) -> Any:
@@ -146,8 +130,6 @@ def _problem(path: Path, data: bytes) -> str | None:
     if data.startswith(LFS_POINTER):
         return LFS_PROBLEM
     try:
-        if suffix == ".dae" and not _has_its_numbers(data):
-            return "array lengths that do not match count="
         count = int.from_bytes(data[80:84], "little")
         if suffix == ".stl" and len(data) == 84 + _TRIANGLE.itemsize * count:
             # Most meshes of robots are such rows, which take a tenth of trimesh's time.
@@ -162,37 +144,6 @@ def _problem(path: Path, data: bytes) -> str | None:
     if (np.abs(corners) <= LARGEST_NUMBER).all():
         return None
     return f"vertices beyond {LARGEST_NUMBER:g} m"
-
-
-def parse_bytes(data: bytes, **options: bool) -> etree._Element:
-    """Return the root element of untrusted XML, without entities, DTD and network.
-
-    ``options`` are more of those of lxml's parser.
-    """
-    safe = {"resolve_entities": False, "no_network": True, "load_dtd": False}
-    return etree.fromstring(data, etree.XMLParser(**safe, **options))
-
-
-def _has_its_numbers(data: bytes) -> bool:
-    """Return whether the arrays of a COLLADA file are as long as it says: SAPIEN reads beyond them
-    otherwise.
-    """
-    # The arrays of a mesh are longer than the texts that libxml2 accepts by itself.
-    root = parse_bytes(data, huge_tree=True)
-    sizes = {}
-    for array in root.iter("{*}float_array"):
-        sizes["#" + array.get("id", "")] = size = len((array.text or "").split())
-        if array.get("count") != str(size):
-            return False
-    ends = (
-        (
-            int(accessor.get("count", "0")) * int(accessor.get("stride", "1"))
-            + int(accessor.get("offset", "0")),
-            accessor.get("source"),
-        )
-        for accessor in root.iterfind("{*}library_geometries//{*}accessor")
-    )
-    return all(0 <= end <= sizes.get(source, -1) for end, source in ends)
 
 
 def mesh_bytes(path: str, content: str) -> bytes:

@@ -12,10 +12,8 @@ parameter identification", IEEE Robotics and Automation Letters 3 (2018).
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from functools import lru_cache
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import mujoco
@@ -26,7 +24,6 @@ from batchpid.arrays.array_types import Document, Float64, MjModel, MjsBody, MjS
 from batchpid.arrays.elementwise import read_only
 from batchpid.arrays.trees import digest
 from batchpid.errors import RobotError
-from batchpid.io.files import write_atomically
 from batchpid.sim.geometry.mesh_files import mesh_bytes, read_mesh
 from batchpid.task_space.frames import SpatialInertia, matrix_of, rotate
 
@@ -67,11 +64,6 @@ class Shape(NamedTuple):
     content: str = ""
     """Digest of the bytes of ``file``, which say what it is: paths and time stamps do not."""
 
-    @property
-    def is_mirrored(self) -> bool:
-        """Whether a factor of a mesh is negative: SAPIEN builds such shapes last."""
-        return min(self.scale) < 0
-
 
 class Triangles(NamedTuple):
     """Triangles: ``vertices`` (v, 3) [m], and ``faces`` (f, 3), numbers of vertices."""
@@ -93,34 +85,6 @@ def hull(shape: Shape) -> Float64:
     if shape.vertices is not None:
         return shape.vertices
     return read_only(mesh_hull(shape.file, shape.content).vertices * shape.scale)
-
-
-def mesh_file(shape: Shape) -> str:
-    """Return the path of a mesh file: the shape's, else that of its hull.
-
-    The hull is written to ``batchpid/meshes`` in the user's cache folder, named by its content.
-    Raises RobotError if it cannot be written.
-    """
-    if shape.vertices is None:
-        return shape.file
-    vertices, faces = convex_hull(shape.vertices)
-    lines = ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in vertices.tolist()]
-    lines += ["f {} {} {}".format(*face) for face in (faces + 1).tolist()]
-    content = ("\n".join(lines) + "\n").encode()
-    # SAPIEN reads meshes from files alone, so a hull becomes one.
-    cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    path = Path(cache, "batchpid", "meshes", f"{digest(content)[:32]}.obj")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        # Another process may have written the same hull.
-        if not path.is_file() or path.read_bytes() != content:
-            write_atomically(path, content)
-    except OSError as error:
-        problem = f"{path}: cannot be written: {error.strerror}"
-        raise RobotError(
-            f"{problem}; set XDG_CACHE_HOME to a folder for the hulls of meshes"
-        ) from error
-    return str(path)
 
 
 def extent(shape: Shape) -> float:

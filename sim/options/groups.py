@@ -171,7 +171,7 @@ class SceneOptions(OptionGroup):
     ``obs.wrench``; default none. It needs ``engine="mujoco"``.
     """
     build: Annotated[Callable[[Any, int], Any] | None, option("snapshot", "scene")] = None
-    """Function ``build(scene, env)`` that adds user content to the ``sapien.Scene`` of each env;
+    """Function ``build(scene, env)`` that adds actors to the ``sapien.Scene`` of each env;
     it needs ``engine="sapien"``.
     Visuals and lights are ignored, so code that was written for a screen runs unchanged. It may
     return the entities that :meth:`batchpid.sim.Runner.poses` reports. A reset returns the content
@@ -266,7 +266,7 @@ class SceneOptions(OptionGroup):
         if falling:
             problem = f"are False, and nothing holds {', '.join(falling)}"
             raise InvalidArgumentError("collisions", problem, remedy="leave it out")
-        for argument in ("ground", "contacts"):
+        for argument in ("ground", "contacts", "build"):
             if getattr(self, argument):
                 problem = "need collisions, which are off"
                 raise InvalidArgumentError(argument, problem, remedy="leave out collisions=False")
@@ -305,9 +305,8 @@ class Controller(Protocol):
     effort of an env must depend on its own rows alone. It travels to the workers by cloudpickle,
     and may call NumPy or a jitted function.
 
-    A setpoint has a number for each joint, unless the controller has an attribute ``command``: a
-    :class:`batchpid.sim.CommandSpec`, or a sequence of names, such as ``("x", "y")``. Then it is
-    (envs, size).
+    A setpoint has a number for each joint, unless the controller has an attribute ``command``, a
+    :class:`batchpid.sim.CommandSpec`. Then it is (envs, size).
 
     A snapshot fits a controller of the same class, whose attribute ``version`` is the same where it
     has one.
@@ -394,10 +393,6 @@ class ControlOptions(OptionGroup):
     is not compensated. On a floating base the passive force is computed as if the base were fixed:
     the weight of the base on the legs depends on their contacts, and the law carries it.
     """
-    free_joints: Annotated[Sequence[str] | None, option("snapshot")] = None
-    """Joints without a motor, whose forces are not compensated; default those that no actuator of
-    an MJCF file moves. A joint whose params have the effort limit 0 gets no effort at all.
-    """
     actuators: Annotated[bp.Actuators | None, option("restored")] = None
     """Delays, limits, friction and errors of motors and sensors: :func:`batchpid.make_actuators`,
     of one row, or one row per env. None, the default, selects the robot's actuators; control
@@ -425,8 +420,8 @@ class ControlOptions(OptionGroup):
     or when a position is beyond 1e6 rad or m. The other envs are not affected.
     """
     on_invalid_input: Annotated[InvalidInputAction, option("next commands")] = "raise"
-    """Response to NaN or infinity in a command or in a pose to reset to: ``"raise"`` (default)
-    raises an error, and ``"contain"`` lets only the env concerned fail.
+    """Response to NaN or infinity in a command: ``"raise"`` (default) raises an error, and
+    ``"contain"`` lets only the env concerned fail.
     """
 
     def fit(self, robot: Robot) -> Self:
@@ -459,13 +454,8 @@ class ControlOptions(OptionGroup):
                 problem = f"'jax' needs JAX on the CPU, and JAX_PLATFORMS is {platforms!r}"
                 remedy = "add cpu to it, or use backend='numpy'"
                 raise InvalidArgumentError("backend", problem, remedy=remedy)
-        free = self.free_joints
-        if free is None:
-            free = [joint.name for joint in robot.joints if not joint.has_motor]
-        for name in names("free_joints", free):
-            choice("free_joints", name, robot.joint_names)
-        values = {"free_joints": tuple(free), "stages": fit_stages(self.stages)}
-        return self.changed(control=control, tool=link, **values)
+        stages = fit_stages(self.stages)
+        return self.changed(control=control, tool=link, stages=stages)
 
     @property
     def control_name(self) -> str:

@@ -152,7 +152,8 @@ class RunnerOptions(RunnerKeywords):
     def scene(self) -> SceneSpec:
         """Description of the scenes, for the engine."""
         options = self.values_for("scene")
-        return scene_of(self.robot, mjcf=self.mjcf, **options)
+        drives = self.control == "drive"
+        return scene_of(self.robot, mjcf=self.mjcf, drives=drives, **options)
 
     def _check_tree(self, argument: str, value: object, remedy: str) -> None:
         """Raise InvalidArgumentError for an option that needs a kinematic tree, if the robot has
@@ -287,7 +288,7 @@ class RunnerOptions(RunnerKeywords):
         if place == "recording":
             values["physics"] = str(self.physics)
             if self.randomization is not None:
-                values["randomization"] = self.randomization.to_dict()
+                values["randomization"] = repr(self.randomization)
         return values
 
     @cached_property

@@ -3,8 +3,8 @@
 Each env has a stream, by default its index, and counts its episodes. The draws of one field come
 from the counter-based generator Philox4x64 (J. K. Salmon et al., "Parallel random numbers: as easy
 as 1, 2, 3", SC 2011) with the key (seed, hash of the field's name) and a counter that begins at (0,
-0, episode, stream). So they depend on these alone, and not on other envs, fields or earlier
-episodes.
+push, episode, stream), with the number of earlier pushes in the episode. So they depend on these
+alone, and not on other envs, fields or earlier episodes.
 """
 
 from __future__ import annotations
@@ -46,13 +46,28 @@ LEADER_FIELDS = ("bias", *JOINT_SIDE)
 """Fields of the actuators that followers do not have."""
 
 
+def env_streams(seed: ArrayLike, num_envs: int, first_env: int = 0) -> Episodes:
+    """Return the stream of each env (envs,): ``seed`` plus its number, or its entry of ``seed``.
+
+    Raises InvalidArgumentError if one is negative or not a whole number, or their number is wrong.
+    """
+    streams = read_array("seed", seed, "iu").astype(np.int64)
+    if streams.ndim == 0:
+        streams = streams + first_env + np.arange(num_envs)
+    # A sum beyond the largest int is negative, too.
+    if streams.shape != (num_envs,) or streams.min() < 0:
+        problem = f"must be a whole number >= 0, or {num_envs} of them, one for each env"
+        raise InvalidArgumentError("seed", problem, value=seed, remedy="pass an int")
+    return streams
+
+
 @dataclass(frozen=True, kw_only=True)
 class Randomization:
     """Distributions of the parameters of the robots, for the option ``randomization`` of
     :class:`batchpid.sim.Runner`.
 
     A field is a distribution (:class:`batchpid.sim.Uniform`, :class:`batchpid.sim.LogUniform`,
-    :class:`batchpid.sim.Normal`, :class:`batchpid.sim.Choice`), drawn for each joint or link, or a
+    :class:`batchpid.sim.Normal`), drawn for each joint or link, or a
     mapping of the names of some joints or links to distributions.
 
     The controller knows the nominal robot: compensation and mass matrix do not change.
@@ -205,13 +220,7 @@ class Randomization:
         """
         episodes = draws.episodes + np.array([0, 1])
         if seed is not None:
-            streams = read_array("seed", seed, "iu").astype(np.int64)
-            if streams.ndim == 0:
-                streams = streams + first_env + np.arange(len(mask))
-            # A sum beyond the largest int is negative, too.
-            if streams.shape != mask.shape or streams.min() < 0:
-                problem = f"must be a whole number >= 0, or {len(mask)} of them, one for each env"
-                raise InvalidArgumentError("seed", problem, value=seed, remedy="pass an int")
+            streams = env_streams(seed, len(mask), first_env)
             episodes = np.stack([streams, np.zeros_like(streams)], 1)
         if mask.all():
             return self.draw(robot, episodes)
@@ -277,15 +286,10 @@ class Randomization:
     # -- files
     # ----------------------------------------------------------------------------------------------
 
-    def to_dict(self) -> Document:
-        """Return the fields that are drawn as plain values, for :meth:`from_dict`."""
-        document = _copied(vars(self), plain=True)
-        return {name: value for name, value in document.items() if value not in (None, {})}
-
     @classmethod
     def from_dict(cls, document: Mapping[str, object]) -> Randomization:
-        """Return the randomization of :meth:`to_dict`, or of a file: ``{"payload": {"uniform": [0,
-        0.5]}, ...}``.
+        """Return the randomization that a file describes: ``{"payload": {"uniform": [0, 0.5]},
+        ...}``.
 
         Raises
         ------
@@ -304,12 +308,10 @@ class Randomization:
         return cls(**values)
 
 
-def _copied(value: Any, plain: bool = False) -> Any:
-    """Return a copy of the mappings in ``value``, with distributions as ``plain`` values or not."""
+def _copied(value: Any) -> Any:
+    """Return a copy of the mappings in ``value``."""
     if isinstance(value, Mapping):
-        return {name: _copied(part, plain) for name, part in value.items()}
-    if plain and isinstance(value, Distribution):
-        return value.to_dict()
+        return {name: _copied(part) for name, part in value.items()}
     return value
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -69,10 +68,7 @@ class Robot:
     actuators: bp.Actuators | None = None
 
     def __repr__(self) -> str:
-        joints = textwrap.shorten(", ".join(self.joint_names), 100, placeholder=" ...")
-        mass = f"{sum(body.mass for body in self.tables.bodies):.4g} kg"
-        head = f"Robot({self.name!r}, {self.dof} dof, {mass}, path={str(self.path)!r},"
-        return f"{head}\n  joints={joints})"
+        return f"Robot({self.name!r}, {self.dof} dof, path={str(self.path)!r})"
 
     @property
     def name(self) -> str:
@@ -259,7 +255,6 @@ class Robot:
         name_or_path: str | Path,
         *,
         package_dirs: Sequence[str | Path] = (),
-        missing_meshes: str = "skip",
         dissipation: str = "urdf",
         fixed_base: bool | None = None,
         self_collision: str = "auto",
@@ -272,9 +267,6 @@ class Robot:
         ----------
         package_dirs
             Folders in which ``package://`` mesh paths are looked up first.
-        missing_meshes
-            ``"skip"`` to leave out collision shapes whose mesh is missing or cannot be read, or
-            ``"error"``.
         dissipation
             ``"urdf"``: joint friction and damping as the URDF says, by the model of
             :mod:`batchpid.motors.friction`. ``"sapien"``: SAPIEN's defaults, PhysX's joint friction
@@ -303,20 +295,17 @@ class Robot:
         RobotError
             The file is no usable URDF or MJCF file, or, with ``strict``, it needs repairs.
         """
-        choice("missing_meshes", missing_meshes, ("error", "skip"))
         choice("dissipation", dissipation, ("urdf", "sapien"))
         choice("self_collision", self_collision, ("auto", "urdf", "none"))
         fixed_base = None if fixed_base is None else flag("fixed_base", fixed_base)
         strict = flag("strict", strict)
         if not isinstance(package_dirs, list | tuple):
-            problem = "must be a list of folders"
-            raise InvalidArgumentError(
-                "package_dirs", problem, value=package_dirs, remedy="pass a list of paths"
-            )
+            problem = "must be a list"
+            raise InvalidArgumentError("package_dirs", problem, remedy="pass a list of folders")
         # A wrong option is not hidden by a fault of the file.
         path = reading.find_robot(name_or_path)
         folders = tuple(file_path("package_dirs", folder) for folder in package_dirs)
-        source = reading.read_robot(path, fixed_base, folders, missing_meshes)
+        source = reading.read_robot(path, fixed_base, folders)
         report(path, source.repairs, strict)
         moving = [joint for joint in source.tables.joints if joint.moves]
         if not moving:

@@ -14,7 +14,7 @@ from dataclasses import replace
 from functools import cached_property
 from operator import itemgetter, methodcaller
 from time import strftime
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,13 +22,13 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.arrays.array_types import Float64, Progress
 from batchpid.checks import check_keywords, choice, instance
-from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError, SingleOwner, warn
+from batchpid.errors import ClosedError, InvalidArgumentError, SingleOwner, warn
 from batchpid.io.files import package_versions
 from batchpid.sim.diagnosis.loop_stability import StabilityCheck
 from batchpid.sim.findings import report_shortfalls
 from batchpid.sim.loop.arrays import Snapshot
 from batchpid.sim.loop.faults import Fault, FaultWarning
-from batchpid.sim.loop.group_control import describe, native_obstacle
+from batchpid.sim.loop.group_control import describe
 from batchpid.sim.options.options import (
     OPTIONS,
     RunnerKeywords,
@@ -57,13 +57,9 @@ from batchpid.sim.runner.operations import (
 )
 from batchpid.sim.signals import CommandSpec, Observation, empty_observation
 from batchpid.sim.tool_space import OperationalSpace
-from batchpid.sim.workers.node import NodeInfo
 from batchpid.sim.workers.pool import Outcome, RecoveryWarning, WorkerPool
 from batchpid.sim.workers.requests import OneCall, Request
 from batchpid.stages.values import Command
-
-if TYPE_CHECKING:
-    from batchpid.sim.recording.recorder import Recorder
 
 CHECKPOINT_STEPS = 8000
 """Least number of sim steps between checkpoints, from the last of which a lost worker is replayed."""
@@ -86,7 +82,7 @@ class Runner(SingleOwner):
         link ``tool``, or a :class:`batchpid.sim.Controller`; forces that are compensated.
     timestep, substeps
         Time step of simulation and control [s]; sim steps of a tick.
-    free_joints, actuators, plan, guard, stages
+    actuators, plan, guard, stages
         Motors and sensors, default the robot's; plan of a slow policy; limits of setpoints; further
         stages of a sim step.
     engine, physics, collisions, ground, build
@@ -121,12 +117,8 @@ class Runner(SingleOwner):
         self.control = checked.control
         self.timestep = checked.timestep
         self.substeps = checked.substeps
-        self.recorder: Recorder | None = None
-        """Recorder of every tick; :class:`batchpid.sim.Recorder` sets it."""
         self._call = OneCall()
         self._state = RunnerState.first(checked)
-        self._sent: Request | None = None  # by send(), until recv()
-        self._is_running = False  # whether the workers run it
         self._cause: BaseException | None = None  # of the end
         self._has_warned = False  # of a fault
         self._stability: StabilityCheck | None = None
@@ -152,8 +144,6 @@ class Runner(SingleOwner):
             self._call.end()
         self.reset(seed=None if self.options.randomization is None else 0)
         self._check_stability()
-        if isinstance(self.control, OperationalSpace):
-            self.control.check_stability()
 
     def _check_stability(self) -> None:
         """Warn of gains beyond the stability bound of the sampled loop."""
@@ -163,8 +153,6 @@ class Runner(SingleOwner):
     def __repr__(self) -> str:
         options = self.options
         state = "closed" if self.closed else f"at {self.time:g} s"
-        if options.stages and (reason := native_obstacle(options)):
-            state += f", law in NumPy or JAX ({reason})"
         return (
             f"Runner({self.robot.name}, {self.num_envs} envs, {options.workers} workers,"
             f" control {options.control_name!r}, {options.engine}, timestep {self.timestep:g} s,"
@@ -204,12 +192,6 @@ class Runner(SingleOwner):
         base_twist
             Velocity of that link's origin and its angular velocity, along the axes of the world,
             (6,) or (envs, 6) [m/s, rad/s]; default 0.
-
-        Raises
-        ------
-        CallOrderError
-            The observation of a tick that was sent has not been received, as for :meth:`step`,
-            :meth:`rollout` and :meth:`restore`.
         """
         self._ready()
         base = {"base_pose": base_pose, "base_twist": base_twist}
@@ -267,67 +249,10 @@ class Runner(SingleOwner):
         substeps
             Sim steps of this tick; default the runner's.
         """
-        if self._sent is not None or self._pool.closed:
+        if self._pool.closed:
             self._ready()
         command = setpoint, setpoint_rate, setpoint_acceleration, feedforward
         self._execute(self._tick(command, latency, substeps))
-        return self._observed()
-
-    def send(
-        self,
-        setpoint: ArrayLike | None,
-        *,
-        setpoint_rate: ArrayLike | None = None,
-        setpoint_acceleration: ArrayLike | None = None,
-        feedforward: ArrayLike | None = None,
-        latency: ArrayLike = 0.0,
-        substeps: int | None = None,
-    ) -> None:
-        """Begin a tick and return, while the workers run it; :meth:`recv` returns its observation.
-
-        The two are bit-identical to one :meth:`step`, and take its arguments. In between,
-        :attr:`time`, :attr:`faults` and the like are those of the tick before; :attr:`info`,
-        assignments, and all methods but :meth:`recv` and :meth:`close` raise CallOrderError. With
-        ``workers=0`` the tick runs in this call.
-
-        Raises
-        ------
-        CallOrderError
-            The observation of the last tick that was sent has not been received.
-        """
-        self._ready()
-        command = setpoint, setpoint_rate, setpoint_acceleration, feedforward
-        run = self._tick(command, latency, substeps)
-        self._prepare(run)
-        self._call.begin()
-        try:
-            self._call.waits = True
-            self._pool.begin(run)
-            self._sent = run
-            self._is_running = True
-        except BaseException as error:
-            self._fail(error)
-            raise
-        finally:
-            if self._pool.closed:
-                self._pool.close()
-            self._call.end()
-
-    def recv(self) -> Observation:
-        """Wait for the end of the tick that :meth:`send` began; return its observation. After an
-        interrupt it can be called again.
-
-        Raises
-        ------
-        CallOrderError
-            No tick was sent since the last call.
-        """
-        self._check_open()
-        if self._sent is None:
-            raise CallOrderError("no tick was sent; call send(setpoint) first")
-        if self._is_running:
-            self._execute(self._sent)
-        self._sent = None
         return self._observed()
 
     def rollout(
@@ -413,7 +338,7 @@ class Runner(SingleOwner):
         # A signal handler may have closed the runner after the tick.
         present: Any = getattr(self._pool, "present", None)
         if present is None:
-            self._check_open()
+            self._ready()
         return self._with_tool(present.observation.map(COPY))
 
     def _with_tool(self, seen: Observation) -> Observation:
@@ -474,19 +399,8 @@ class Runner(SingleOwner):
 
     @property
     def actuators(self) -> bp.Actuators | None:
-        """Actuators, None for ideal ones; assign others to change them in flight. Delays keep their
-        histories.
-
-        As in the option, assign None for the robot's own actuators, and ``bp.Actuators()`` for
-        ideal ones.
-        """
+        """Actuators; None for ideal ones. A snapshot brings its own."""
         return self._state.actuators
-
-    @actuators.setter
-    def actuators(self, actuators: bp.Actuators | None) -> None:
-        self._ready()
-        checked = self.options.check_actuators(actuators)
-        self._execute(Request("set_actuators", (checked,)))
 
     def snapshot(self) -> Snapshot:
         """Return the state of all envs, physics and controller, for :meth:`restore`.
@@ -618,11 +532,6 @@ class Runner(SingleOwner):
         """Process ids of the workers."""
         return tuple(worker.pid for worker in self._pool.workers if worker.pid is not None)
 
-    @property
-    def nodes(self) -> tuple[NodeInfo, ...]:
-        """Machines of a cluster, in the order of their envs; empty without ``cluster``."""
-        return self._pool.nodes
-
     def close(self) -> None:
         """End the workers and free the scenes. May be called again, as after an interrupt."""
         self._pool.closed = True
@@ -650,19 +559,6 @@ class Runner(SingleOwner):
     # -------------------------------------------------------------------------------------
 
     def _ready(self) -> None:
-        """Check that no tick was sent, and as :meth:`_check_open`.
-
-        Raises
-        ------
-        CallOrderError
-            The observation of a tick that was sent has not been received.
-        """
-        self._check_open()
-        if self._sent is not None:
-            problem = "the observation of the last tick has not been received"
-            raise CallOrderError(f"{problem}; call recv() first")
-
-    def _check_open(self) -> None:
         """Check that the runner can be used.
 
         Raises
@@ -692,10 +588,6 @@ class Runner(SingleOwner):
             count = self.substeps
         else:
             count = checked_option("substeps", substeps)
-        if self.recorder is not None and count != self.substeps:
-            problem = f"is not the runner's {self.substeps}"
-            remedy = "all ticks of a recording have the same length"
-            raise InvalidArgumentError("substeps", problem, value=count, remedy=remedy)
         inputs = dict(zip(Command._fields, arrays, strict=True))
         command, chunks = self._command(inputs, latency, count * self.timestep)
         for chunk in chunks:
@@ -740,30 +632,25 @@ class Runner(SingleOwner):
             self._execute(Request("add_chunk", (chunk, latency)))
 
     def _execute(self, request: Request) -> Outcome:
-        """Execute a request, or complete the one that was sent; then issue warnings.
+        """Execute a request, then issue warnings.
 
         Ctrl-C does not interrupt it between the request and the new state. The runner is closed if
         the workers cannot complete the request, or if a second Ctrl-C ends it.
         """
         call = self._call
         pool = self._pool
-        is_sent = self._is_running
         is_run = request.method == "run"
-        if not is_sent:
-            self._prepare(request)
+        self._prepare(request)
         # From here on Ctrl-C waits, so that workers and state change together or not at all.
         call.begin()
         try:
-            call.waits, before = True, self._state
-            if not is_sent:
-                pool.begin(request)
+            call.waits = True
+            pool.begin(request)
             outcome = pool.finish()
-            call.waits = self._is_running = False
+            call.waits = False
             # Ticks before a failure count: the workers have run them.
             if outcome.failure is None or is_run:
-                self._state = committed(self.options, before, outcome)
-            if is_run and self.recorder is not None:
-                self._record(self.recorder, before, outcome)
+                self._state = committed(self.options, self._state, outcome)
             if outcome.failure is not None and request.changes_loop:
                 self._fail(outcome.failure.error)
         except BaseException as error:
@@ -786,8 +673,7 @@ class Runner(SingleOwner):
         return outcome
 
     def _prepare(self, request: Request) -> None:
-        """Take a checkpoint if one is due, before ticks or a reset, and let the recorder keep the
-        state before its first tick.
+        """Take a checkpoint if one is due, before ticks or a reset.
 
         Before a reset it is one that the loops do not notice. It holds all that there is of an env
         after its next reset. With ``build`` that is not so: the user's content is not rebuilt.
@@ -796,8 +682,6 @@ class Runner(SingleOwner):
         if request.method == "run":
             if is_due and self._keeps_bits:
                 self._take_snapshot()
-            if self.recorder is not None:
-                self.recorder.prepare()
         elif is_due and request.method == "reset":
             keeps_rest = self._keeps_bits or self.options.build is not None
             if not (keeps_rest or self._pool.replay.waits):
@@ -809,18 +693,6 @@ class Runner(SingleOwner):
     def _keeps_bits(self) -> bool:
         """Whether envs go on with the same bits after a snapshot as without it."""
         return "complete_state" in self.options.load_engine().capabilities
-
-    def _record(self, recorder: Recorder, before: RunnerState, outcome: Outcome) -> None:
-        """Pass completed ticks on to the recorder."""
-        run = outcome.request
-        for number, arrays in enumerate(outcome.completed):
-            time = (before.steps + (number + 1) * run.substeps) * self.timestep
-            recorder.append(
-                time,
-                run.command.map(itemgetter(number)),
-                self._with_tool(arrays.observation.map(COPY)),
-                None if number else before.changes,
-            )
 
     def _fail(self, error: BaseException) -> None:
         """End the runner, which cannot complete a command."""

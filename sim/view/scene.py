@@ -6,6 +6,7 @@ The triangles are made, or read from mesh files, by ``trimesh``.
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import imported
 from batchpid.sim.description.tables import Visual
 from batchpid.sim.findings import Finding
-from batchpid.sim.geometry.mesh_files import find_mesh, read_mesh
+from batchpid.sim.geometry.mesh_files import read_mesh
 from batchpid.sim.geometry.shapes import convex_hull
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_model import link_tree
@@ -146,7 +147,7 @@ def surfaces(robot: Robot, segments: int = 24) -> tuple[list[Surface], list[Find
             parts: dict[Rgba, list[Any]] = {}
             try:
                 for visual in visuals:
-                    mesh = _mesh(visual, robot, segments)
+                    mesh = _mesh(visual, segments)
                     parts.setdefault(visual.rgba or _GREY, []).append(mesh)
             except OSError as error:
                 shape, reason = error.args
@@ -164,23 +165,20 @@ def surfaces(robot: Robot, segments: int = 24) -> tuple[list[Surface], list[Find
     return drawn, findings
 
 
-def _read_mesh(name: str, robot: Robot) -> Any:
-    """Return the result of ``trimesh`` for a mesh file of the robot, in metres. Raises
-    OSError with the name and the reason.
+def _read_mesh(file: str) -> Any:
+    """Return the result of ``trimesh`` for a mesh file, in metres. Raises OSError with the name and
+    the reason.
     """
-    path = find_mesh(name, robot.path, robot.source.package_dirs)
-    if path is None:
-        raise OSError(name, "not found")
     try:
-        loaded = read_mesh(path, path.read_bytes())
+        loaded = read_mesh(file, Path(file).read_bytes())
     except Exception as error:
-        raise OSError(name, f"{type(error).__name__}: {error}") from error
+        raise OSError(file, f"{type(error).__name__}: {error}") from error
     if not len(loaded.faces):
-        raise OSError(name, "no triangles")
+        raise OSError(file, "no triangles")
     return loaded
 
 
-def _mesh(visual: Visual, robot: Robot, segments: int) -> Any:
+def _mesh(visual: Visual, segments: int) -> Any:
     """Return the ``trimesh.Trimesh`` of a shape in its link's frame.
 
     Raises OSError with the name of a shape that cannot be read, and the reason.
@@ -194,7 +192,7 @@ def _mesh(visual: Visual, robot: Robot, segments: int) -> Any:
         if shape.vertices is not None:
             surface: Any = convex_hull(shape.vertices)
         else:
-            surface = _read_mesh(shape.file, robot)
+            surface = _read_mesh(shape.file)
         mesh: Any = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
         mesh.apply_scale(shape.scale)
     elif shape.kind == "box":

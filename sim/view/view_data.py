@@ -173,7 +173,7 @@ def recorded_robot(rollout: Rollout) -> Robot:
     if isinstance(info.description, Robot):
         return info.description
     if info.urdf is None:
-        problem = f"of the recording, {info.robot!r}, is unknown: its file was gone"
+        problem = f"of the recording, {info.robot!r}, is unknown: a URDF cannot hold it"
         remedy = "name its URDF or MJCF file"
         raise InvalidArgumentError("robot", problem, remedy=remedy)
     with TemporaryDirectory(prefix="batchpid-") as folder:

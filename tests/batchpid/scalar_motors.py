@@ -120,7 +120,6 @@ class ScalarMotor:
     position_offset: float = 0.0
     backlash: float = 0.0
     position_resolution: float = 0.0
-    velocity_resolution: float = 0.0
     continuous: bool = False
     efforts: list = field(default_factory=list)
     measured: list = field(default_factory=list)
@@ -165,7 +164,7 @@ class ScalarMotor:
         velocity = self.late(velocities, steps, 0.0, lambda a, b: a - b)
         return (
             rounded(position + self.position_offset, self.position_resolution),
-            rounded(velocity, self.velocity_resolution),
+            velocity,
         )
 
     def late(self, values, steps, before, less):

@@ -23,9 +23,9 @@ def run_motor(chosen, efforts, qpos=0.0, qvel=0.0, before=0.0):
     rows = np.asarray(efforts, float).reshape(len(efforts), 1, -1)
     at, speed = np.zeros_like(rows[0]) + qpos, np.zeros_like(rows[0]) + qvel
     state = actuators.init(chosen, at, DT, qvel=speed, effort=np.zeros_like(rows[0]) + before)
-    delivered = []
+    k, delivered = actuators.discretise(chosen, state, DT), []
     for row in rows:
-        state, effort = actuators.deliver(chosen, state, read_only(row, float), at, speed, DT)
+        state, effort = actuators.advance_effort(k, state, read_only(row, float), speed)
         delivered.append(effort)
     return np.array(delivered)
 
@@ -92,8 +92,9 @@ def test_noise_depends_on_seed_env_episode_and_step_alone():
             actuators.init(chosen, q[: len(envs)], DT, envs=np.array(envs), episode=episode),
             [],
         )
+        k = actuators.discretise(chosen, state, DT)
         for _ in range(5):
-            state, *seen = actuators.measure(chosen, state, q[: len(envs)], q[: len(envs)], DT)
+            state, *seen = actuators.advance_measurement(k, state, *[q[: len(envs)]] * 2)
             rows.append(seen)
         return np.array(rows)
 
@@ -114,8 +115,9 @@ def test_noise_is_the_same_in_jax_for_one_robot_at_a_time():
 
     def measure(env, q):
         state, rows = actuators.init(chosen, q, DT, envs=env), []
+        k = actuators.discretise(chosen.for_rank(q.ndim), state, DT)
         for _ in range(3):
-            state, *seen = actuators.measure(chosen, state, q, q, DT)
+            state, *seen = actuators.advance_measurement(k, state, q, q)
             rows.append(seen)
         return rows
 

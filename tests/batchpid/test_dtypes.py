@@ -47,9 +47,7 @@ def run_of(xp, dtype, seed, own):
     yield (guarded := guards.init(limits, y))
     yield guards.advance(limits, guarded, row["setpoint"], DT)[0]
     motors = bp.make_actuators(JOINTS, **MOTORS, dtype=own)
-    yield (moved := bp.motors.init(motors, y, DT, qvel=v, effort=u))
-    yield from bp.motors.deliver(motors, moved, u, y, v, DT)
-    yield from bp.motors.measure(motors, moved, y, v, DT)
+    yield bp.motors.init(motors, y, DT, qvel=v, effort=u)
 
 
 MOTORS = {"command_delay": 0.02, "sensor_delay": 0.01, "lag": 0.1, "backlash": 0.1}

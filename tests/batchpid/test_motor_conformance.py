@@ -59,7 +59,6 @@ MOTORS = {
     "position_offset": (0.0, 0.1),
     "backlash": (0.0, 0.3),
     "position_resolution": (0.0, 0.01),
-    "velocity_resolution": (0.0, 0.1),
 }
 """Options that are numbers: the value that is off, and one that has an effect."""
 
@@ -155,8 +154,9 @@ class MotorCase(GuardCase):
         return motors.init(model._replace(max_delay=self.longest), start, DT)
 
     def step(self, model, state, effort, qpos, qvel):
-        state, *seen = motors.measure(model, state, qpos, qvel, DT)
-        state, delivered = motors.deliver(model, state, effort, qpos, qvel, DT)
+        k = motors.discretise(model.for_rank(qpos.ndim), state, DT)
+        state, *seen = motors.advance_measurement(k, state, qpos, qvel)
+        state, delivered = motors.advance_effort(k, state, effort, qvel)
         return state, (*seen, delivered)
 
     def oracle(self, env, joint):

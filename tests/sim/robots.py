@@ -41,6 +41,6 @@ def load_published(name):
         return load_bundled(name)
     if not (PUBLISHED / name).is_file():
         pytest.skip("example-robot-data is not installed")
-    robot = Robot.load(PUBLISHED / name, missing_meshes="skip")
+    robot = Robot.load(PUBLISHED / name)
     joints = tuple(dataclasses.replace(joint, friction=0.0) for joint in robot.joints)
     return dataclasses.replace(robot, joints=joints)

@@ -65,7 +65,7 @@ def file_scene(
 
     Raises RobotError if the file has changed since the robot was loaded.
     """
-    compiled = compile_scene(Path(file.path), file.is_whole)
+    compiled = compile_scene(Path(file.path))
     scene, model = compiled.scene, compiled.model
     if compiled.content != file.content:
         raise RobotError(

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import ctypes
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
 from typing import Any
 
@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64, MjData, MjModel, Rows
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
-from batchpid.sim.engine.mujoco.mujoco_sensors import wrench_tables
 from batchpid.sim.engine.native import FARTHEST, WIDTH, number, structure
 from batchpid.sim.engine.native_model import NativeModel, aligned, table
 
@@ -34,6 +33,8 @@ Arrays = dict[str, NDArray[Any]]
 _NO_CONTACT = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 _NEVER = 1 << 30
 """Age without a proof: NEVER in ``clearance.h``."""
+_FLAGS = 0x5AA55AA5
+"""Value of ``opt.disableflags`` by which its place in ``mjModel`` is found."""
 _POINTERS = "body_geomnum", "body_contype", "body_conaffinity"
 _BEGINNING = 4096
 """Number of bytes at the start of ``mjModel`` that are searched for its options; ``mjModel`` is
@@ -155,7 +156,7 @@ def _arms(robot: RobotMj, pairs: NDArray[np.intp]) -> tuple[Float64, Float64]:
             across = np.linalg.norm(np.cross(points[:, :3], axes[at]), axis=1)
             arms[at] = (across + points[:, 3]).max(initial=0.0)
         add(data.xpos[body], reach, model.body_parentid[body])
-    floats = robot.base is not None
+    floats = len(model.jnt_type) > dof
     moved = np.zeros((model.nbody, dof + 2 * floats), bool)
     for body in range(1, model.nbody):
         # What moves a body moves its children.
@@ -167,29 +168,29 @@ def _arms(robot: RobotMj, pairs: NDArray[np.intp]) -> tuple[Float64, Float64]:
     return np.where(differs, arms[: moved.shape[1]], 0.0), travel
 
 
+def _offset(address: int, size: int, value: int, kind: type[np.generic]) -> int | None:
+    """Return the offset [bytes] of the only ``value`` in ``size`` bytes of memory; None if it is
+    ambiguous.
+    """
+    memory = np.frombuffer(ctypes.string_at(address, size), kind)
+    indices = np.flatnonzero(memory == value)
+    return int(indices[0]) * memory.itemsize if len(indices) == 1 else None
+
+
 @cache
 def places() -> tuple[int, ...] | None:
     """Return the offsets of ``opt.disableflags`` and of the pointers :data:`_POINTERS` in
-    ``mjModel`` [bytes].
-
-    The flags are found by a change of one of them, the pointers by their values. None if one is
-    ambiguous.
+    ``mjModel`` [bytes], found by their values. None if one is ambiguous.
     """
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
-    before = ctypes.string_at(model._address, _BEGINNING)
-    # One bit differs between the two copies of the model's beginning.
-    model.opt.disableflags ^= _NO_CONTACT
-    after = ctypes.string_at(model._address, _BEGINNING)
-    flags = [place for place in range(_BEGINNING) if before[place] != after[place]]
-    addresses = [getattr(model, name).ctypes.data for name in _POINTERS]
+    model.opt.disableflags = _FLAGS
+    values = [getattr(model, name).ctypes.data for name in _POINTERS]
+    address = model._address
     offsets = [
-        (8 * np.flatnonzero(np.frombuffer(after, np.uint64) == address)).tolist()
-        for address in addresses
+        _offset(address, _BEGINNING, _FLAGS, np.int32),
+        *(_offset(address, _BEGINNING, value, np.uint64) for value in values),
     ]
-    is_clear = len(flags) == 1 and flags[0] % 4 == 0 and all(len(words) == 1 for words in offsets)
-    if is_clear:
-        return (flags[0], *(words[0] for words in offsets))
-    return None
+    return None if None in offsets else tuple(filter(None, offsets))
 
 
 class GroupClearance:
@@ -213,7 +214,7 @@ class GroupClearance:
         robots = len(data)
         pairs = len(tables["pairs"])
         bodies = models[0].nbody
-        floats = bool((models[0].jnt_type == mujoco.mjtJoint.mjJNT_FREE).any())
+        floats = models[0].njnt > dof
         blocks, ways = -(-robots // WIDTH), dof + 2 * floats
         arrays = tables | {
             # Native code reads the places of shapes where MuJoCo writes them.
@@ -274,8 +275,8 @@ def place_of_contacts() -> int | None:
     # The number lies between these two arrays of the structure.
     start = data.solver_fwdinv.ctypes.data
     size = data.energy.ctypes.data - start
-    places = np.flatnonzero(np.frombuffer(ctypes.string_at(start, size), np.int32) == _COUNT)
-    return start - data._address + 4 * int(places[0]) if len(places) == 1 else None
+    offset = _offset(start, size, _COUNT, np.int32)
+    return None if offset is None else start - data._address + offset
 
 
 class FreeMotions:
@@ -332,8 +333,10 @@ class FreeMotions:
             sensed=sensed.shape[1],
         )
 
-    def use(self, models: Sequence[MjModel]) -> None:
-        """Take the constants of the robots' models (M,), which may have changed."""
+    def use(self, models: Sequence[MjModel], wrenches: Mapping[str, Rows]) -> None:
+        """Take the constants of the robots' models (M,), which may have changed, and their
+        :func:`.wrench_tables`.
+        """
         at = self._robot.qvel
         kinds = models[:1] if all(model is models[0] for model in models) else models
         columns = {
@@ -349,8 +352,7 @@ class FreeMotions:
                 "drive_limit": [model.actuator_forcerange[:, 1] for model in kinds],
             }
         self._arrays |= {name: table(np.array(rows), self.size) for name, rows in columns.items()}
-        if self._structure.wrenches:
-            self._arrays |= wrench_tables(self._robot, self._rigid.tables, models)
+        self._arrays |= wrenches
         # In place, since native code has the address.
         self._structure.model = self._rigid.address
         for name, array in self._arrays.items():
@@ -367,13 +369,10 @@ class FreeMotions:
         is_touching = self.contact == number("Contact", "SOME")
         self.contact[is_touching] = number("Contact", "UNKNOWN")
 
-    def read(self) -> tuple[Float64, Float64, Float64]:
-        """Return positions, velocities and last accelerations (M, dof)."""
-        qpos, qvel, acceleration = (
-            np.array(array.swapaxes(1, 2).reshape(-1, array.shape[1])[: self.size])
-            for array in self._states
-        )
-        return qpos, qvel, acceleration
+    def read(self, state: int) -> Float64:
+        """Return positions, velocities or last accelerations (M, dof): ``state`` 0, 1, 2."""
+        array = self._states[state]
+        return np.array(array.swapaxes(1, 2).reshape(-1, array.shape[1])[: self.size])
 
     def write(self, rows: Sequence[int] | slice, *states: Rows | float) -> None:
         """Set positions, velocities and last accelerations (len(rows), dof) of robots ``rows``."""

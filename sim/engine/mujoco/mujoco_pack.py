@@ -6,7 +6,7 @@ Longer than 350 lines because that is the whole interface between loop and engin
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
@@ -16,19 +16,16 @@ import numpy as np
 
 from batchpid.arrays.array_types import Bool, Float64, MjData, Rows
 from batchpid.motors import Actuators
-from batchpid.sim.description.merging import coupling_of
 from batchpid.sim.description.tables import CONTACT_FRICTION
-from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.mujoco.file_scene import check_links
 from batchpid.sim.engine.mujoco.free_motion import FreeMotions, place_of_contacts
 from batchpid.sim.engine.mujoco.model_builder import (
     FLOATING,
     LARGEST_FORCE,
-    RobotMj,
     robot_model,
     set_inertia,
 )
-from batchpid.sim.engine.mujoco.mujoco_sensors import MujocoLinkSensors
+from batchpid.sim.engine.mujoco.mujoco_sensors import MujocoLinkSensors, wrench_tables
 from batchpid.sim.engine.mujoco.mujoco_step import STATE, DataPool, MujocoStep, obstacle, rest
 from batchpid.sim.engine.native import FARTHEST
 from batchpid.sim.engine.protocol import BASE_AT_REST, Engine, EnginePack
@@ -55,53 +52,36 @@ class MujocoPack(EnginePack):
         workspace: dict[object, DataPool] | None = None,
     ) -> None:
         super().__init__(spec, size, first_env, variation, not obstacle())
-        self._workspace = {} if workspace is None else workspace
         varied = self._variation
         self._worlds_vary = varied.ground_friction is not None or varied.gravity is not None
         self.qf = np.zeros((size, self.dof))
-        self._actuators: Actuators | None = None
-        coupling = coupling_of(spec.joints)
-        viscous = self.friction.viscous
-        if not coupling.is_identity and spec.mjcf is None:  # else MuJoCo has the file's equalities
-            self._constraint = ConstraintEfforts(
-                size, coupling, np.zeros(self.dof, bool), spec.timestep
-            )
-            self._constraint.implicit[...] = spec.timestep * (0.0 if viscous is None else viscous)
-        if spec.mjcf is not None:
+        if spec.mjcf is None:  # else MuJoCo has the file's equalities
+            reads = self.spec.fixed_base and self.steps_read_force(True, True)
+            self._couple(np.zeros(self.dof, bool), None if reads else self.joint_model)
+        else:
             links = *(spec.contacts or ()), *(spec.wrenches or ()), spec.carrier
             check_links(spec, spec.mjcf, filter(None, links))
-        self._stiffness = self._rate_gain = self._target_rate = np.zeros((1, self.dof))
-        self._make_data(robot_model(spec))
-        if variation is not None:
-            self.write_joints(None)
-
-    def _make_data(self, robot: RobotMj) -> None:
-        """Make the robots, with their masses."""
-        if robot not in self._workspace:
-            self._workspace[robot] = DataPool(robot)
-        self._robot, self._pool = robot, self._workspace[robot]
+        self._stiffness = self._rate_gain = np.zeros((1, self.dof))
+        self._robot = robot = robot_model(spec)
+        if workspace is None:
+            workspace = {}
+        if robot not in workspace:
+            workspace[robot] = DataPool(robot)
+        self._pool = workspace[robot]
         self._sensors = MujocoLinkSensors(self.spec, robot.model, robot.bodies)
         self._sensed = np.zeros((self.size, self._sensors.size))
         self.models, self.rows = [self._pool.model] * self.size, self._pool.initial(self.size)
         self._at, self._moves = robot.qpos, robot.qvel
         self._free: FreeMotions | None = None
-        if self.steps_natively and self._moves_freely:
+        # A robot that touches nothing is then a tree of rigid bodies, under efforts alone.
+        is_tree = spec.fixed_base and spec.mjcf is None and self.dof > 0
+        if self.steps_natively and is_tree and place_of_contacts() is not None:
             self._free = FreeMotions(robot, self.joint_model, self._sensed)
-        if self._constraint is not None and self.steps_natively:
-            force = None if self._reads_bias else self.joint_model
-            self._constraint.use(self.joint_model, force)
         self._change_world(range(self.size))
         self._change_masses(range(self.size))
         self._update(range(self.size))
-
-    @property
-    def _moves_freely(self) -> bool:
-        """Whether a robot that touches nothing is a tree of rigid bodies on a fixed base, under
-        efforts alone.
-        """
-        spec = self.spec
-        is_tree = spec.fixed_base and spec.mjcf is None and self.dof > 0
-        return is_tree and place_of_contacts() is not None
+        if variation is not None:
+            self.write_joints(None)
 
     @property
     def data(self) -> list[MjData]:
@@ -118,7 +98,10 @@ class MujocoPack(EnginePack):
         if self._free is None:
             self._evaluate(rows)
         else:
-            self._free.use(self.models)
+            wrenches = {}
+            if self.spec.wrenches:
+                wrenches = wrench_tables(self.spec, self._masses.added, self.size)
+            self._free.use(self.models, wrenches)
         self.calls = object()
         self._own_step: MujocoStep | None = None
 
@@ -141,27 +124,18 @@ class MujocoPack(EnginePack):
 
     def read_qpos(self) -> Float64:
         if self._free is not None:
-            return self._free.read()[0]
+            return self._free.read(0)
         return np.array([data.qpos[self._at] for data in self.data])
 
     def read_qvel(self) -> Float64:
         if self._free is not None:
-            return self._free.read()[1]
+            return self._free.read(1)
         return np.array([data.qvel[self._moves] for data in self.data])
 
     def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
-        if self.steps_read_force(gravity, coriolis):
-            if self._free is not None:
-                return self._force(self.force_model, True, True)
+        if self._free is None and self.steps_read_force(gravity, coriolis):
             return np.array([data.qfrc_bias[self._moves] for data in self.data])
         return self._force(self.force_model, gravity, coriolis)
-
-    @property
-    def _reads_bias(self) -> bool:
-        """Whether the forces in the equations of motion are the passive force, with the bits that
-        native steps read.
-        """
-        return self.spec.fixed_base and self.steps_read_force(True, True)
 
     # -- stepping
     # ----------------------------------------------------------------------------------------------
@@ -209,14 +183,10 @@ class MujocoPack(EnginePack):
             self._free,
         )
 
-    def update_constraint(self, rows: Sequence[int] | slice = slice(None)) -> None:
-        if self._constraint is None:
-            return
-        if self._reads_bias:
-            bias = self.passive_force(True, True)
-        else:
-            bias = self._force(self.joint_model, True, True)
-        self._constraint.update(self.joint_model.mass_matrix, self.read_qpos(), bias, rows)
+    def _bias(self) -> Float64:
+        if self.spec.fixed_base and self.steps_read_force(True, True):
+            return self.passive_force(True, True)
+        return self._force(self.joint_model, True, True)
 
     # -- changes
     # ----------------------------------------------------------------------------------------------
@@ -231,7 +201,7 @@ class MujocoPack(EnginePack):
         """Return pose and velocities of the bodies of floating bases (M, 13), angular ones in the
         body's axes.
         """
-        qpos, qvel = self._robot.base or (0, 0)
+        qpos, qvel = self._robot.base
         parts = slice(qpos, qpos + FLOATING + 1), slice(qvel, qvel + FLOATING)
         return np.array(
             [np.concatenate([data.qpos[parts[0]], data.qvel[parts[1]]]) for data in self.data]
@@ -260,11 +230,10 @@ class MujocoPack(EnginePack):
     def push(self, rows: Sequence[int], twists: Float64) -> None:
         data = self.data
         turns = matrix_of(self._bases()[rows, 3:7])
-        _, at = self._robot.base or (0, 0)
+        _, at = self._robot.base
         for row, twist, turn in zip(rows, twists, turns, strict=True):
-            data[row].qvel[at : at + 3] += twist[:3]
             # MuJoCo's angular velocities are in the body's axes.
-            data[row].qvel[at + 3 : at + FLOATING] += turn.T @ twist[3:]
+            data[row].qvel[at : at + FLOATING] += [*twist[:3], *(turn.T @ twist[3:])]
         self._evaluate(rows)
 
     def write_state(
@@ -295,9 +264,8 @@ class MujocoPack(EnginePack):
     ) -> None:
         """Write the states of robots ``rows`` to their data."""
         everyone = self._pool.take(self.models, self.rows, rows)
-        floats = self._robot.base is not None
         bases = np.tile(BASE_AT_REST, (len(rows), 1)) if base is None else base.copy()
-        at, moves = self._robot.base or (0, 0)
+        at, moves = self._robot.base
         # MuJoCo's angular velocities are in the body's axes.
         bases[:, 10:] = unrotate(matrix_of(bases[:, 3:7]), bases[:, 10:])
         for row, root, position, velocity in zip(rows, bases, qpos, qvel, strict=True):
@@ -305,7 +273,7 @@ class MujocoPack(EnginePack):
             # Everything else of the scene returns to its start, but drives keep their targets.
             ctrl = data.ctrl.copy()
             rest(self.models[row], data)
-            if floats:
+            if not self.spec.fixed_base:
                 data.qpos[at : at + FLOATING + 1], data.qvel[moves : moves + FLOATING] = np.split(
                     root, [FLOATING + 1]
                 )
@@ -319,22 +287,36 @@ class MujocoPack(EnginePack):
         self._suspended[...] = mask
 
     def write_joints(self, actuators: Actuators | None, rows: Sequence[int] | None = None) -> None:
-        self._actuators = actuators
         armature, damping = self._robot.terms
         values = {"dof_armature": np.maximum(armature + self._add_joints(actuators), 0.0)}
         if self.spec.mjcf is not None and self._variation.damping is not None:
             values["dof_damping"] = np.maximum(damping + self._variation.damping, 0.0)
-        tables = {name: np.broadcast_to(table, self.qf.shape) for name, table in values.items()}
-        for row in range(self.size) if rows is None else rows:
-            for name, table in tables.items():
-                if not np.array_equal(
-                    getattr(self.models[row], name)[self._robot.qvel], table[row]
-                ):
-                    # A copy only where it differs: a model takes much memory.
-                    model = self._own_model(row)
-                    getattr(model, name)[self._robot.qvel] = table[row]
-                    mujoco.mj_setConst(model, self._scratch)
+        everyone = range(self.size)
+        for row in self._set(everyone if rows is None else rows, self._moves, values):
+            mujoco.mj_setConst(self.models[row], self._scratch)
         self._share()
+
+    def _set(
+        self,
+        rows: Iterable[int],
+        at: slice | Rows,
+        values: Mapping[str, Rows],
+    ) -> list[int]:
+        """Set the entries ``at`` of fields of the models of robots ``rows`` to ``values`` (M | 1,
+        entries, ...); return the robots whose models changed.
+        """
+        changed = []
+        for row in rows:
+            present = {name: table[row % len(table)] for name, table in values.items()}
+            model = self.models[row]
+            # A copy only where they differ: a model takes much memory.
+            if all(np.array_equal(getattr(model, name)[at], new) for name, new in present.items()):
+                continue
+            model = self._own_model(row)
+            for name, new in present.items():
+                getattr(model, name)[at] = new
+            changed.append(row)
+        return changed
 
     def _share(self) -> None:
         """Return to one shared model if neither masses nor worlds nor armature nor drives of the
@@ -408,40 +390,30 @@ class MujocoPack(EnginePack):
         self._change_model(rows)
 
     def write_drive(self, stiffness: Rows, damping: Rows, force_limit: Rows) -> None:
-        """Set the drive of every joint; each argument broadcasts to (M, dof).
+        """Set the drive of every joint, of a spec with drives; each argument broadcasts to (M,
+        dof).
 
         They are MuJoCo's actuators, implicit in the time step dt as PhysX's are: with the velocity
         v+ after it, the effort kp (r - q - dt v+) + kd (r' - v+) is a drive's with stiffness kp and
         implicit damping kd + dt kp.
         """
-        if self._robot.model.nu == 0:
-            states = self.read_state()
-            self._release()
-            self._make_data(robot_model(self.spec, drives=True))
-            self.write_joints(self._actuators)
-            self.write_state_rows(states)
         limit = np.broadcast_to(np.minimum(force_limit, LARGEST_FORCE), self.qf.shape)
         self._stiffness, self._rate_gain = (
             np.broadcast_to(table, self.qf.shape).copy() for table in (stiffness, damping)
         )
-        gains = np.stack(
-            [-self._stiffness, -self._rate_gain - self.spec.timestep * self._stiffness], axis=2
-        )
-        for row in range(self.size):
-            model = self.models[row]
-            if not (
-                np.array_equal(model.actuator_biasprm[:, 1:3], gains[row])
-                and np.array_equal(model.actuator_forcerange[:, 1], limit[row])
-            ):
-                model = self._own_model(row)
-                model.actuator_biasprm[:, 1:3] = gains[row]
-                model.actuator_forcerange[:] = np.stack([-limit[row], limit[row]], axis=1)
+        bias = np.zeros((*self.qf.shape, mujoco.mjNBIAS))
+        bias[..., 1] = -self._stiffness
+        bias[..., 2] = -self._rate_gain - self.spec.timestep * self._stiffness
+        values = {
+            "actuator_biasprm": bias,
+            "actuator_forcerange": np.stack([-limit, limit], axis=2),
+        }
+        self._set(range(self.size), slice(None), values)
         self._update(range(self.size))
 
     def write_drive_target(self, position: Rows, velocity: Rows | None = None) -> None:
-        if velocity is not None:
-            self._target_rate = velocity
-        values = self._stiffness * position + self._rate_gain * self._target_rate
+        rate = 0.0 if velocity is None else velocity
+        values = self._stiffness * position + self._rate_gain * rate
         if self._free is not None:
             self._free.ctrl[...] = values
             return
@@ -476,17 +448,8 @@ class MujocoPack(EnginePack):
         return [np.hstack([data.xpos[numbers], data.xquat[numbers]]) for data in self.data]
 
     def close(self) -> None:
-        self._release()
-        self.models = []
-
-    def _release(self) -> None:
-        """Give back all that fits the present kind of model alone: working memory, and data made
-        for its size.
-        """
         self._pool.leave(self.rows if self._free is None else self._free)
-        self._own_step = None
-        for name in ("_scratch", "_rubbing"):
-            self.__dict__.pop(name, None)
+        self.models = []
 
 
 @contextmanager

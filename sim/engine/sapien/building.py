@@ -15,11 +15,10 @@ from sapien.wrapper.articulation_builder import ArticulationBuilder
 from batchpid.arrays.array_types import Float64
 from batchpid.errors import RobotError
 from batchpid.sim.description.tables import CONTACT_FRICTION
-from batchpid.sim.engine.sapien.limits import Words, filter_words
-from batchpid.sim.engine.sapien.user_content import Frames, HeadlessScene
+from batchpid.sim.engine.sapien.limits import filter_words
+from batchpid.sim.engine.sapien.user_content import HeadlessScene
 from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.geometry.mesh_files import mesh_bytes
-from batchpid.sim.geometry.shapes import Shape, hull, mesh_file
+from batchpid.sim.geometry.shapes import Shape, hull
 from batchpid.task_space.frames import SpatialInertia, matrix_of
 
 SAPIEN_DISSIPATION = 0.05
@@ -34,9 +33,6 @@ _building = RLock()
 """Lock of the thread that builds a robot: SAPIEN's settings are process-wide, and builders are
 shared.
 """
-
-_meshes_read: dict[str, str] = {}
-"""Content of each mesh file that SAPIEN has read in this process: it reads no path again."""
 
 _JOINT_TYPES = {
     "fixed": "fixed",
@@ -53,8 +49,6 @@ _ALONG_Z = Pose(q=[0.7071068, 0.0, 0.7071068, 0.0])
 def articulation_builder(spec: SceneSpec) -> ArticulationBuilder:
     """Return a builder that makes any number of copies of the robot, the same object for equal
     specs.
-
-    Raises RobotError for a body whose moments of inertia are not positive.
     """
     builder = ArticulationBuilder()
     tables = spec.simulated
@@ -67,7 +61,7 @@ def articulation_builder(spec: SceneSpec) -> ArticulationBuilder:
             parent = links[joint.parent_link]
         links[body.name] = link = builder.create_link_builder(parent)
         link.set_name(body.name)
-        moments, axes = _principal(body.inertia, body.name)
+        moments, axes = _principal(body.inertia)
         frame = _pose(body.center, matrix_of(body.inertia_wxyz))
         link.set_mass_and_inertia(body.mass, frame * _pose(np.zeros(3), axes), moments)
         if joint is None:
@@ -85,38 +79,34 @@ def articulation_builder(spec: SceneSpec) -> ArticulationBuilder:
             turn,
             damping=joint.damping,
         )
-    for shape in tables.shapes if spec.collisions else ():
-        _add_shape(links[shape.body], shape)
     return builder
 
 
-def _add_shape(link: Any, shape: Shape) -> None:
+def _collision_shape(shape: Shape) -> physx.PhysxCollisionShape:
+    """Return SAPIEN's object for a shape. Raises RobotError for a mesh that PhysX refuses."""
     material = physx.PhysxMaterial(CONTACT_FRICTION, CONTACT_FRICTION, RESTITUTION)
     place = _pose(shape.position, matrix_of(shape.wxyz))
     size = shape.size
+    built: physx.PhysxCollisionShape
     if shape.kind == "box":
-        link.add_box_collision(place, size, material)
+        built = physx.PhysxCollisionShapeBox(np.array(size, np.float32), material)
     elif shape.kind == "sphere":
-        link.add_sphere_collision(place, *size, material)
+        built = physx.PhysxCollisionShapeSphere(*size, material)
     elif shape.kind == "capsule":
-        link.add_capsule_collision(place * _ALONG_Z, *size, material)
+        built = physx.PhysxCollisionShapeCapsule(*size, material)
     elif shape.kind == "cylinder":
-        link.add_cylinder_collision(place * _ALONG_Z, *size, material)
+        built = physx.PhysxCollisionShapeCylinder(*size, material)
     else:
-        scale = shape.scale
-        if min(scale) < 0:
-            # Two convex meshes of negative scale that touch end the process in PhysX, so a mirrored
-            # mesh gets a file of its own.
-            shape = shape._replace(vertices=hull(shape))
-            scale = (1.0, 1.0, 1.0)
-        file = mesh_file(shape)
-        if shape.vertices is None:
-            mesh_bytes(file, shape.content)
-            if _meshes_read.setdefault(file, shape.content) != shape.content:
-                problem = "has changed since this process simulated it, and SAPIEN keeps the mesh"
-                remedy = "start Python again, or save the mesh under another name"
-                raise RobotError(f"{file}: {problem} that it read first; {remedy}")
-        link.add_convex_collision_from_file(file, place, scale, material)
+        try:
+            built = physx.PhysxCollisionShapeConvexMesh(hull(shape), np.ones(3), material)
+        except RuntimeError as error:
+            problem = f"link {shape.owner!r}: PhysX cannot build a collision shape"
+            remedy = "repair the file, or remove that <collision>"
+            raise RobotError(f"{problem} from {shape.file}: {error}; {remedy}") from error
+    if shape.kind in ("capsule", "cylinder"):
+        place = place * _ALONG_Z
+    built.set_local_pose(place)
+    return built
 
 
 def _pose(position: Float64, axes: Float64) -> Pose:
@@ -136,7 +126,7 @@ def _axes_along(axis: tuple[float, ...]) -> Float64:
     return np.column_stack([first, second, np.cross(first, second)])
 
 
-def _principal(inertia: Float64, name: str) -> tuple[Float64, Float64]:
+def _principal(inertia: Float64) -> tuple[Float64, Float64]:
     """Return the principal moments (3,) and axes (3, 3), those of the frame if they are
     principal.
     """
@@ -145,20 +135,15 @@ def _principal(inertia: Float64, name: str) -> tuple[Float64, Float64]:
     if not np.array_equal(np.diag(moments), inertia):
         moments, axes = np.linalg.eigh(inertia)
         axes[:, 2] *= np.sign(np.linalg.det(axes))
-    if not (moments > 0).all():
-        raise RobotError(
-            f"link {name!r}: moments of inertia {moments} must be positive; correct <inertia>"
-        )
     return moments, axes
 
 
 def set_inertia(link: physx.PhysxArticulationLinkComponent, inertia: SpatialInertia) -> None:
     """Give one of SAPIEN's links this inertia, in the frame of the link."""
-    principal, axes = np.linalg.eigh(inertia.tensor)
+    moments, axes = inertia.principal
     link.set_mass(inertia.mass)
-    # A rotation, not a reflection.
-    link.set_cmass_local_pose(_pose(inertia.center, axes * np.linalg.det(axes)))
-    link.set_inertia(principal)
+    link.set_cmass_local_pose(_pose(inertia.center, axes))
+    link.set_inertia(moments)
 
 
 @contextmanager
@@ -207,7 +192,7 @@ def build_scene(
     """Return a new scene in ``system`` and the robot in it, with the ground and the dissipation of
     ``spec``.
 
-    Raises RobotError if SAPIEN cannot build a collision shape, which it would silently leave out.
+    Raises RobotError if SAPIEN cannot build a collision shape.
     """
     scene = HeadlessScene(system)
     with engine_settings(spec):
@@ -216,7 +201,7 @@ def build_scene(
         builder.set_scene(None)  # the scene can be freed
         if spec.ground and spec.collisions:
             scene.add_ground(0.0, render=False)
-    _set_words(spec, robot)
+        _add_shapes(spec, robot)
     robot.set_sleep_threshold(0.0)
     dissipation = SAPIEN_DISSIPATION if spec.dissipation == "sapien" else 0.0
     for link in robot.links:
@@ -236,36 +221,11 @@ def build_scene(
     return scene, robot
 
 
-def _set_words(spec: SceneSpec, robot: physx.PhysxArticulation) -> None:
-    """Set the filter words of the shapes of a robot."""
-    words = _shape_words(spec)
-    for link in robot.links:
-        shapes = link.collision_shapes
-        if len(shapes) != len(words[link.name]):
-            meshes = [shape.file for shape in spec.simulated.shapes if shape.body == link.name]
-            files = ", ".join(filter(None, meshes))
-            remedy = "repair the file, or remove that <collision>"
-            raise RobotError(
-                f"link {link.name!r}: SAPIEN cannot build a collision shape from {files}; {remedy}"
-            )
-        for shape, groups in zip(shapes, words[link.name], strict=True):
-            shape.set_collision_groups(groups)
-
-
-@lru_cache(maxsize=8)
-def _shape_words(spec: SceneSpec) -> dict[str, list[Words]]:
-    """Return the filter words of the shapes of each simulated link, in the order of its shapes."""
+def _add_shapes(spec: SceneSpec, robot: physx.PhysxArticulation) -> None:
+    """Give the links of a robot their collision shapes, with filter words."""
     words, _ = filter_words(spec)
-    of_links: dict[str, list[Words]] = {body.name: [] for body in spec.simulated.bodies}
+    links = {link.name: link for link in robot.links}
     for shape in spec.simulated.shapes if spec.collisions else ():
-        of_links[shape.body].append(words[shape.owner])
-    return of_links
-
-
-def link_frames(spec: SceneSpec, robot: physx.PhysxArticulation) -> Frames:
-    """Return all links of the URDF, in the entities of ``robot``, which is one of ``spec``."""
-    entities = {link.name: link.entity for link in robot.links}
-    return {
-        name: (entities[at.link], None if at.link == name else Pose(at.position, at.wxyz))
-        for name, at in spec.simulated.links.items()
-    }
+        built = _collision_shape(shape)
+        built.set_collision_groups(words[shape.owner])
+        links[shape.body].attach(built)

@@ -10,7 +10,7 @@ from trees import NAMES, planar, robot_of, states, tool_of, tree_of
 
 import batchpid.task_space as ts
 from batchpid.errors import InvalidArgumentError, RobotError
-from batchpid.sim import Robot, to_urdf
+from batchpid.sim import Robot
 
 POINT = np.array([0.1, -0.2, 0.3])
 
@@ -31,7 +31,7 @@ def test_mujoco_computes_the_same(case, native, monkeypatch):
     import mujoco
 
     tree, tool, robot = case
-    spec = mujoco.MjSpec.from_string(to_urdf(robot).text)
+    spec = mujoco.MjSpec.from_file(str(robot.path))
     spec.compiler.fusestatic, spec.compiler.discardvisual = False, True
     model = spec.compile()
     data, columns = (

@@ -74,8 +74,8 @@ def test_a_mesh_that_cannot_be_read_is_named(batchpid, tmp_path):
     status, _, err = batchpid("view", path, *SHORT, "--time-limit", 0.1)
     assert status == 0
     missing, broken = err.splitlines()
-    assert "link 'base' ('no.stl'): cannot be drawn (not found)" in missing
-    assert "link 'arm' ('<b>.stl'): cannot be drawn" in broken
+    assert "link 'base' ('<visual>'): cannot be drawn ('no.stl' not found)" in missing
+    assert "<b>.stl'): cannot be drawn" in broken
 
 
 def test_the_robot_of_a_recording_is_shown(batchpid, tmp_path):
@@ -94,13 +94,12 @@ def test_the_robot_of_a_recording_is_shown(batchpid, tmp_path):
 
 
 def test_a_recording_without_robot_asks_for_its_file(batchpid, tmp_path):
-    """Its file was gone when it was recorded."""
-    path = tmp_path / "arm.urdf"
-    path.write_text(load_bundled("panda").path.read_text())
-    arm = Robot.load(path)
-    path.unlink()
-    run = write(tmp_path / "run.h5", arm, name="arm")
-    problem = "robot: of the recording, 'arm', is unknown: its file was gone; name its URDF"
+    """A URDF cannot hold the mesh of an MJCF file."""
+    path = tmp_path / "arm.xml"
+    mesh = '<asset><mesh name="m" vertex="0 0 0  1 0 0  0 1 0  0 0 1"/></asset>'
+    body = '<worldbody><body><joint/><geom type="mesh" mesh="m"/></body></worldbody>'
+    path.write_text(f'<mujoco model="arm">{mesh}{body}</mujoco>')
+    run = write(tmp_path / "run.h5", Robot.load(path), name="arm")
+    problem = "robot: of the recording, 'arm', is unknown: a URDF cannot hold it; name its"
     assert problem in batchpid("view", "--play", run)[2]
-    path.write_text(load_bundled("panda").path.read_text())
     assert batchpid("view", path, *SHORT, "--play", run, "--time-limit", 0.1)[0] == 0

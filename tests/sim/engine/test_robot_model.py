@@ -12,7 +12,7 @@ import pytest
 from tiny_urdf import random_tree, robot, write
 
 import batchpid.task_space as ts
-from batchpid.sim import Randomization, Robot, Runner, Uniform, to_urdf
+from batchpid.sim import Randomization, Robot, Runner, Uniform
 from batchpid.sim.robot.robot_model import link_tree
 
 ENGINES = ("sapien", "mujoco")
@@ -29,7 +29,7 @@ def load(name, folder, **options):
 
 def own_model(arm):
     """Return MuJoCo's reading of the robot's URDF, and the columns of its joints."""
-    spec = mujoco.MjSpec.from_string(to_urdf(arm).text)
+    spec = mujoco.MjSpec.from_file(str(arm.path))
     for geom in spec.geoms:
         spec.delete(geom)
     if not arm.fixed_base:
@@ -99,7 +99,7 @@ def test_a_sim_step_obeys_the_mass_matrix(name, fixed_base, engine, tmp_path):
 
 def edited(arm, change):
     """Return the URDF of a robot whose links ``change(link, inertial)`` has edited."""
-    urdf = ElementTree.fromstring(to_urdf(arm).text)
+    urdf = ElementTree.fromstring(arm.path.read_text())
     for number, link in enumerate(urdf.findall("link")):
         if (inertial := link.find("inertial")) is not None:
             change(number, inertial)

@@ -8,7 +8,7 @@ import pytest
 from tiny_urdf import INERTIAL, joint, link, one_joint, robot, write
 
 from batchpid.errors import RobotError, RobotNotFoundError
-from batchpid.sim import Robot, Runner, to_mjcf, to_urdf
+from batchpid.sim import Robot, Runner, to_mjcf
 
 BASE, ARM, TIP = link("base"), link("arm"), link("tip")
 HINGE = joint("hinge", "base", "arm")
@@ -155,7 +155,7 @@ def test_an_xinclude_is_not_followed(tmp_path):
         '<xi:include xmlns:xi="http://www.w3.org/2001/XInclude" href="/etc/passwd" parse="text"/>'
     )
     loaded = Robot.load(write(tmp_path, robot(BASE, ARM, HINGE, include)))
-    assert "root:" not in to_urdf(loaded).text
+    assert [finding.code for finding in loaded.repairs] == ["unknown-element"]
 
 
 def test_building_writes_no_file(tmp_path, monkeypatch):
@@ -182,13 +182,11 @@ def test_a_default_namespace_is_ignored(head, tmp_path):
         Robot.load(write(tmp_path, text, f"{at}.urdf")) for at, text in enumerate((plain, named))
     ]
     assert robots[0].tables == robots[1].tables
-    assert to_urdf(robots[0]).text == to_urdf(robots[1]).text
 
 
 def test_a_robot_without_a_name_is_called_after_its_file(tmp_path):
     loaded = Robot.load(write(tmp_path, one_joint().replace(' name="test"', ""), "arm.urdf"))
     assert loaded.name == "arm"
-    assert '<robot name="arm">' in to_urdf(loaded).text
 
 
 def test_a_joint_gets_a_name_that_no_other_has(tmp_path):
