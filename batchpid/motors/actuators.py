@@ -3,7 +3,7 @@ r"""Parameters and state of actuators and sensors: build, broadcast, validate, s
 An effect that is off is ``None``: it is not a leaf and costs nothing. Every effect is declared
 once, with its unit, bounds and group, as a field of :class:`Actuators`.
 
-A file in YAML or JSON has one entry per joint, with the options of :func:`make_actuators`; a joint
+A file in YAML has one entry per joint, with the options of :func:`make_actuators`; a joint
 that is left out has ideal actuators (:class:`batchpid.io.documents.RecordFile`)::
 
     format: batchpid-actuators-1
