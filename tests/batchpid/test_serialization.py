@@ -169,7 +169,7 @@ def test_every_effect_of_motors_survives_a_file(dtype, tmp_path):
 def test_a_file_of_motors_written_by_hand(tmp_path):
     path = tmp_path / "a.yaml"
     path.write_text("""
-format: batchpid-actuators-1
+format: batchpid-actuators-2
 joints:
   elbow: {strength: 0.9}
   shoulder: {coulomb: [0.1, 0.2]}

@@ -105,7 +105,6 @@ COMBINATIONS = {
         },
     ],
     bp.make_actuators: [
-        {"sensor_delay": 0.01, "max_delay": 0.005},
         {"static": 0.1, "coulomb": [0.1, 0.2]},
         {"no_load_speed": ..., "saturation_effort": 10.0},
         {"saturation_effort": ..., "no_load_speed": 10.0},
@@ -147,7 +146,6 @@ COMBINATIONS = {
     bp.track: [{"ki": ..., "params": bp.make_params(2, 1.0)}],
     batchpid.export.to_c: [
         {"params": bp.make_params(2, np.ones((2, 2)))},
-        {"inputs": (), "params": bp.make_params(2, 1.0, measurement_rate="measured")},
         {"inputs": ("velocity",)},
         {"prefix": "a-b"},
         {"tree": planar((1.0,))},
@@ -359,11 +357,7 @@ def test_an_unknown_option_is_answered_with_the_nearest():
             "'effort_limit'"
             in refused("efort_limit", function, **needed(function), efort_limit=3.0).remedy
         )
-    for function in (
-        params.replace,
-        actuators.replace,
-        lambda **options: bp.presets.tutorial(2, **options),
-    ):
+    for function in (params.replace, actuators.replace):
         assert "'effort_limit'" in refused("efort_limit", function, efort_limit=3.0).remedy
     assert "joints, kp, ki, kd" in refused("zzzzzzz", bp.make_params, 2, kp=1.0, zzzzzzz=1).remedy
 
@@ -372,7 +366,7 @@ def test_an_unknown_option_is_answered_with_the_nearest():
 # --------------------------------------------------------------------------------------------------
 
 PID = '{"format": "batchpid-params-2", "joints": {"elbow": {%s}}}'
-MOTOR = "format: batchpid-actuators-1\njoints: {elbow: {%s}}"
+MOTOR = "format: batchpid-actuators-2\njoints: {elbow: {%s}}"
 TEXTS = [
     *((text, "text", None) for text in ('{"joints": {}}', "[1, 2]", '{"format": "batchpid')),
     ('{"format": "batchpid-params-2", "joint": {}}', "key", None),
@@ -394,9 +388,9 @@ TEXTS = [
     ('{"format": "batchpid-params-2", "about": 3, "joints": {"a": {"kp": 1.0}}}', "about", None),
     (MOTOR % "kp: 1", "kp", "elbow"),
     (MOTOR % "strength: strong", "strength", "elbow"),
-    ("format: batchpid-actuators-1\njoints: {shoulder: {}}", "text", None),
-    ("format: batchpid-actuators-1\njoints: {elbow: [1]}", "joints", "elbow"),
-    ("format: batchpid-actuators-1\nseed: soon\njoints: {elbow: {}}", "seed", None),
+    ("format: batchpid-actuators-2\njoints: {shoulder: {}}", "text", None),
+    ("format: batchpid-actuators-2\njoints: {elbow: [1]}", "joints", "elbow"),
+    ("format: batchpid-actuators-2\nseed: soon\njoints: {elbow: {}}", "seed", None),
     *((text, "text", None) for text in ("- 1", "format: [")),
 ]
 """Text of params or of actuators, the key that is wrong, and its joint."""
