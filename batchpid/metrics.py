@@ -58,7 +58,7 @@ class StepMetrics(NamedTuple):
     """Share of samples in saturation."""
 
     def __repr__(self) -> str:
-        return array_summary(self, "envs", "joints")
+        return array_summary(self)
 
 
 @np.errstate(divide="ignore", invalid="ignore")

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Float64
-from batchpid.arrays.records import array_summary
 from batchpid.checks import at_least, broadcast, positive, read_array, time_step
 from batchpid.errors import InvalidArgumentError
 
@@ -40,9 +39,6 @@ class Trajectory(NamedTuple):
     position: Float64
     velocity: Float64
     acceleration: Float64
-
-    def __repr__(self) -> str:
-        return array_summary(self, "ticks", *["envs"] * (self.position.ndim - 2), "joints")
 
     @property
     def ticks(self) -> int:

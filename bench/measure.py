@@ -257,7 +257,7 @@ def main(options: Options) -> None:
         },
         "phases": {phase: round(us, 2) for phase, us in measure_phases(workload).items()},
     }
-    calls = native.describe_calls("SAPIEN", load_engine("sapien").native_obstacle())
+    calls = load_engine("sapien").native_obstacle() or "native calls"
     print(f"{options.robot}, {options.num_envs} envs, {workload.processes} processes, {calls}\n")
     columns = figures["rates"], figures["ratios"], figures["per_process"]
     rows = [

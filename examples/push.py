@@ -49,11 +49,9 @@ class PushVectorEnv(ToolReachVectorEnv):
     workspace = (0.15, 0.15, 0.0)
 
     def __init__(self, num_envs=1, *, tolerance=0.02, **options):
-        super().__init__(num_envs, tolerance=tolerance, **options)
+        scene = {"engine": "sapien", "build": build_box, "ground": True}
+        super().__init__(num_envs, tolerance=tolerance, **scene, **options)
         self.goal = np.zeros((num_envs, 2))
-
-    def runner_options(self):
-        return super().runner_options() | {"engine": "sapien", "build": build_box, "ground": True}
 
     def spaces(self):
         return spaces.Box(-100.0, 100.0, (2 * self.robot.dof + 12,)), super().spaces()[1]

@@ -10,7 +10,7 @@ from stable_baselines3 import PPO
 from batchpid.sim.gym import SB3VecEnv
 
 if __name__ == "__main__":
-    options = {"actions": "increment", "autoreset_mode": "SameStep", "workers": 0}
+    options = {"actions": "increment", "autoreset_mode": "Disabled", "workers": 0}
     envs = SB3VecEnv(
         gymnasium.make_vec("batchpid.sim.gym:batchpid/Reach-v0", num_envs=4, **options)
     )

@@ -8,7 +8,7 @@ moves each hand to its goal.
 import numpy as np
 from gymnasium import spaces
 
-from batchpid.sim import OperationalSpace
+from batchpid.sim import OperationalSpace, Robot
 from batchpid.sim.gym import RobotVectorEnv
 
 
@@ -37,16 +37,14 @@ class ToolReachVectorEnv(RobotVectorEnv):
     ahead = (0.0, 0.0, 0.0)  # center of the workspace, from the hand in the posture [m]
     workspace = (0.15, 0.15, 0.15)  # from the center to the sides [m]
 
-    def __init__(self, num_envs=1, robot="panda", *, tolerance=0.01, **options):
+    def __init__(self, num_envs=1, *, tolerance=0.01, **options):
         self.tolerance = tolerance
         self.goal = np.zeros((num_envs, 3))
-        super().__init__(num_envs, robot, **options)
-
-    def runner_options(self):
-        control = OperationalSpace(self.robot, "panda_hand", posture=self.posture, stiffness=400.0)
+        robot = Robot.load("panda")
+        control = OperationalSpace(robot, "panda_hand", posture=self.posture, stiffness=400.0)
         self.home = np.array(control.command.neutral)
         self.center = self.home[:3] + self.ahead
-        return {"control": control}
+        super().__init__(num_envs, robot, control=control, **options)
 
     def spaces(self):
         return spaces.Box(-100.0, 100.0, (2 * self.robot.dof + 6,)), spaces.Box(

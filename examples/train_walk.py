@@ -7,7 +7,6 @@ The algorithm is in ``ppo.py``. The policy sets the joints' setpoints 50 times a
 each joint follows them at 500 Hz, in MuJoCo. docs/training.md explains the choices.
 """
 
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +16,7 @@ import tyro
 from matplotlib.figure import Figure
 from walk import WalkVectorEnv
 
-from batchpid.sim import Recorder, plots
+from batchpid.sim import Observation, Rollout, plots, write_recording
 
 SCORES = ("speed", "distance")  # of the learning curve
 MARGIN = 0.2  # share of the commanded speed by which a robot that walks may be off
@@ -63,10 +62,17 @@ def evaluate(act, config):
     raw, _ = envs.reset(seed=config.seed + 1_000_000)  # other starts than in the training
     steps, runner = round(config.time / envs.unwrapped.step_seconds), envs.unwrapped.runner
     forward, fell = np.zeros(config.evaluated), np.zeros(config.evaluated, bool)
-    with nullcontext() if config.record is None else Recorder(config.record, runner):
-        for _ in range(steps):
-            raw, _, terminated, _, info = envs.step(act(raw))
-            forward, fell = forward + info["speed"] / steps, fell | terminated
+    start, setpoints, observed = runner.info, [], []
+    for _ in range(steps):
+        raw, _, terminated, _, info = envs.step(act(raw))
+        forward, fell = forward + info["speed"] / steps, fell | terminated
+        setpoints.append(envs.setpoint)
+        observed.append(envs.observed.map(lambda rows: rows[None]))
+    if config.record is not None:
+        time = envs.step_seconds * np.arange(1.0, steps + 1)
+        seen = Observation.join(observed)
+        run = Rollout(time, np.array(setpoints), seen, envs.step_seconds, start)
+        write_recording(run, config.record, overwrite=True)
     envs.close()
     return forward, info["distance"] / config.time, fell
 

@@ -49,10 +49,9 @@ class WalkVectorEnv(RobotVectorEnv):
         robot = Robot.load("quadruped", fixed_base=False)
         self.commands = np.array(commands)
         self._clock, self._command = np.zeros(num_envs), np.zeros((num_envs, 3))
-        super().__init__(num_envs, robot, params=robot.params(), compensate="none", **options)
-
-    def runner_options(self):
-        return {"control": "pid", "ground": True}
+        super().__init__(
+            num_envs, robot, params=robot.params(), compensate="none", ground=True, **options
+        )
 
     def spaces(self):
         dof = self.robot.dof

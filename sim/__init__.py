@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from batchpid.sim.options.options import RunnerOptions
     from batchpid.sim.randomization.distributions import Choice, LogUniform, Normal, Uniform
     from batchpid.sim.randomization.randomization import Randomization
-    from batchpid.sim.recording.recorder import Recorder
     from batchpid.sim.recording.recording_files import (
         RecordingError,
         read_recording,
@@ -51,7 +50,6 @@ __all__ = [
     "OperationalSpace",
     "Physics",
     "Randomization",
-    "Recorder",
     "RecordingError",
     "RecoveryWarning",
     "RepairWarning",
@@ -86,7 +84,6 @@ _PLACES = {
     "OperationalSpace": "batchpid.sim.tool_space",
     "Physics": "batchpid.sim.engine.scene_spec",
     "Randomization": "batchpid.sim.randomization.randomization",
-    "Recorder": "batchpid.sim.recording.recorder",
     "RecordingError": "batchpid.sim.recording.recording_files",
     "RecoveryWarning": "batchpid.sim.workers.pool",
     "RepairWarning": "batchpid.sim.findings",

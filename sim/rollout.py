@@ -33,16 +33,16 @@ if TYPE_CHECKING:
 RECORDED = {
     "setpoint": Quantity(np.float64, "setpoint", "rad|m"),
     "feedforward": Quantity(np.float64, "effort added before saturation", "N m|N"),
-    "changes": Quantity(np.uint8, "reset 1, restore 2, params 4, actuators 8", columns={}),
+    "changes": Quantity(np.uint8, "reset 1, restore 2, params 4", columns={}),
 } | QUANTITIES
 """Quantity of each array of a :class:`Rollout`, ``time`` aside."""
 OPTIONAL = ("feedforward", "changes")
 """Arrays of a :class:`Rollout` that may be None."""
 
 
-RESET, RESTORE, PARAMS, ACTUATORS = 1, 2, 4, 8
-"""Bits of :attr:`Rollout.changes`: the envs were reset, a snapshot was restored, params or
-actuators were assigned.
+RESET, RESTORE, PARAMS = 1, 2, 4
+"""Bits of :attr:`Rollout.changes`: the envs were reset, a snapshot was restored, params were
+assigned.
 """
 _OF_ROBOT = (
     "joint_names",
@@ -125,8 +125,6 @@ class RunInfo:
     """Versions of the packages that results depend on, by name."""
     begun: str | None = None
     """Local date and time of the start, ISO 8601."""
-    complete: bool = True
-    """False for a recording that was cut short, or is still being written."""
     faults: tuple[Any, ...] = ()
     """Faults (:class:`batchpid.sim.Fault`) of the runner up to the end of the run."""
     randomization: Document | None = None

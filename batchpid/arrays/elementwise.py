@@ -21,8 +21,6 @@ from batchpid.errors import MissingDependencyError
 T = TypeVar("T")
 V = TypeVar("V")
 TURN = 2 * math.pi
-NAMED_TUPLES: list[type] = [*CHOICE_TYPES]
-"""Types of records, choices and states that JAX is still to know, for files of ``jax.export``."""
 _NUMPY_OR_NEUTRAL = frozenset({np.ndarray, NoneType, float, int, *CHOICE_TYPES})
 
 
@@ -34,25 +32,8 @@ def namespace(*leaves: Array) -> ArrayModule:
         for leaf in leaves:
             if not isinstance(leaf, np.ndarray) and hasattr(leaf, "__array_namespace__"):
                 module: ArrayModule = leaf.__array_namespace__()
-                if getattr(module, "__name__", "") == "jax.numpy":
-                    _register_in_jax()
                 return module
     return np
-
-
-def exported(kind: type[T]) -> type[T]:
-    """Decorate a named tuple that ``jax.export`` is to write into files."""
-    NAMED_TUPLES.append(kind)
-    return kind
-
-
-def _register_in_jax() -> None:
-    """Register the named tuples for ``jax.export``. Nothing else in JAX needs it."""
-    while NAMED_TUPLES:
-        from jax.export import register_namedtuple_serialization
-
-        kind = NAMED_TUPLES.pop()
-        register_namedtuple_serialization(kind, serialized_name=f"batchpid.{kind.__name__}")
 
 
 def in_dtype_of(params: Iterable[Array], *arrays: Array) -> list[Array]:

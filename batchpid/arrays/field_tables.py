@@ -61,25 +61,22 @@ class Field(NamedTuple):
         name: str,
         values: Array,
         joint_names: Sequence[str] | None,
-        *,
-        infinite: bool = False,
         kind: AxisKind = "joint",
     ) -> Array:
         """Return ``values`` (..., envs, joints) after a check of the bounds; values that JAX traces
         are not checked.
 
-        Raises InvalidArgumentError if an entry is out of bounds, or infinite where neither
-        ``infinite`` nor ``neutral`` allows it.
+        Raises InvalidArgumentError if an entry is out of bounds, or infinite where ``neutral`` is
+        not.
         """
         if not is_traced(values):
-            infinite = infinite or math.isinf(self.neutral)
             at_least(
                 name,
                 values,
                 self.low,
                 joint_names,
                 above=self.above,
-                infinite=infinite,
+                infinite=math.isinf(self.neutral),
                 kind=kind,
             )
             remedy = f"use a number from {self.low:g} to {self.high:g} ({self.unit})"

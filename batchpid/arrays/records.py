@@ -23,7 +23,7 @@ from typing import Any, ClassVar, ParamSpec, TypeVar
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Document, DType, Rows
-from batchpid.arrays.elementwise import NAMED_TUPLES, namespace
+from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.field_tables import Field
 from batchpid.arrays.trees import mapped, parts
 from batchpid.checks import (
@@ -41,6 +41,8 @@ P = ParamSpec("P")
 R = TypeVar("R", bound="Record")
 T = TypeVar("T")
 MOST_JOINTS = 100_000
+ANY_NUMBER = Field(neutral=math.inf, low=-math.inf)
+"""Field of any number but NaN."""
 LINE_WIDTH = 130
 """Longest line of a representation."""
 Ends = tuple[Array, Array]
@@ -57,9 +59,6 @@ class Record(tuple[Any, ...]):
     """Declared fields of numbers, by name."""
     WHOLE: ClassVar[tuple[str, ...]] = ()
     """Leaves with one value for all joints."""
-
-    def __init_subclass__(cls) -> None:
-        NAMED_TUPLES.append(cls)
 
     def options(self) -> Document:
         """Return the options that are on, as arguments of the constructor that build this record
@@ -128,28 +127,21 @@ class Record(tuple[Any, ...]):
 
         A leaf without a declared field may hold any numbers.
         """
-        if joint_names is None:
-            joints = self.num_joints
-        else:
-            joints = len(joint_names)
-        shapes = (1, joints), (num_envs, joints)
+        joints = self.num_joints if joint_names is None else len(joint_names)
         for name, leaf in self.leaves().items():
             if name in self.WHOLE:
                 continue
-            if leaf.shape not in shapes:
-                problem = f"has shape {leaf.shape}, not {shapes[0]} or {shapes[1]}"
-                remedy = "give one row, or one row per env"
-                raise InvalidArgumentError(f"{self.NAME}.{name}", problem, remedy=remedy)
-            if leaf.dtype != self.dtype:
-                problem = f"is {leaf.dtype}, another one is {self.dtype}"
-                raise InvalidArgumentError(f"{self.NAME}.{name}", problem, remedy="use one dtype")
+            argument = f"{self.NAME}.{name}"
+            if leaf.dtype != self.dtype or leaf.shape not in ((1, joints), (num_envs, joints)):
+                problem = f"is {leaf.dtype} {leaf.shape}, not {self.dtype} ({num_envs}, {joints})"
+                remedy = "give one row, or one row per env, of one dtype"
+                raise InvalidArgumentError(argument, problem, remedy=remedy)
             if not is_traced(leaf):
-                field = self.FIELDS.get(name, Field(low=-math.inf))
-                values = np.asarray(leaf)
-                field.checked(f"{self.NAME}.{name}", values, joint_names, infinite=True)
+                field = self.FIELDS.get(name, ANY_NUMBER)
+                field.checked(argument, np.asarray(leaf), joint_names)
 
     def __repr__(self) -> str:
-        return array_summary(self, "envs", "joints")
+        return array_summary(self)
 
 
 def with_fields(*fields: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
@@ -242,11 +234,17 @@ class LeafBuilder:
 
         ``size``, ``low`` and ``high`` name the options of both ends, the lower and the upper one.
         """
-        # Either the size or its ends: the check of both together follows.
-        end = Field(neutral=math.inf, low=-math.inf)
-        fields = {size: end._replace(low=0.0), low: end, high: end}
-        read = {name: self.array(name, values.get(name), field) for name, field in fields.items()}
-        least, most = checked_ends(read, self.names)
+        extent = self.array(size, values.get(size), ANY_NUMBER._replace(low=0.0))
+        least, most = (self.array(name, values.get(name), ANY_NUMBER) for name in (low, high))
+        # Either the size or its ends.
+        if extent is not None:
+            if least is not None or most is not None:
+                problem = f"is given together with {low} or {high}"
+                remedy = "give the symmetric limit, or the two ends"
+                raise InvalidArgumentError(size, problem, remedy=remedy)
+            least, most = -extent, extent
+        elif not (least is None or most is None or is_traced(least) or is_traced(most)):
+            entries(low, least, least <= most, f"exceeds {high}", self.names)
         least = None if is_everywhere(least, -math.inf) else least
         return least, None if is_everywhere(most, math.inf) else most
 
@@ -282,39 +280,14 @@ class LeafBuilder:
         raise InvalidArgumentError(name, problem, remedy=remedy)
 
 
-def checked_ends(values: Mapping[str, Array], joint_names: Sequence[str] | None) -> Ends:
-    """Return the lower and the upper end of limits, None for no limit.
-
-    ``values`` are the size of both, the lower and the upper end, by the names of their arguments.
-
-    Raises InvalidArgumentError if the size is given with an end, or the lower end exceeds the upper
-    one.
-    """
-    size_name, low_name, high_name = values
-    size, low, high = values.values()
-    if size is not None:
-        if low is not None or high is not None:
-            problem = f"is given together with {low_name} or {high_name}"
-            remedy = "give the symmetric limit, or the two ends"
-            raise InvalidArgumentError(size_name, problem, remedy=remedy)
-        return -size, size
-    if low is not None and high is not None and not (is_traced(low) or is_traced(high)):
-        least, most = np.broadcast_arrays(low, high)
-        entries(low_name, least, least <= most, f"exceeds {high_name}", joint_names)
-    return low, high
-
-
 def frozen(record: R) -> R:
     """Return a record with read-only NumPy arrays, which later writes by the caller do not
     change.
 
-    Writeable arrays and views are copied. If all arrays are read-only, ``record`` itself is
-    returned.
     """
-    # Most records are frozen already, and cost one look.
-    if not any(map(_can_be_written, record)):
-        return record
-    copied: R = mapped(lambda leaf: frozen_array(leaf) if _can_be_written(leaf) else leaf, record)
+    copied: R = mapped(
+        lambda leaf: frozen_array(leaf) if isinstance(leaf, np.ndarray) else leaf, record
+    )
     return copied
 
 
@@ -330,27 +303,6 @@ def is_everywhere(array: Array, value: float | bool | str) -> bool:
     return array is None or (not is_traced(array) and bool((array == value).all()))
 
 
-def _can_be_written(leaf: Array) -> bool:
-    return isinstance(leaf, np.ndarray) and (leaf.flags.writeable or not leaf.flags.owndata)
-
-
-def span(values: Array) -> str:
-    """Return the range of an array's entries, as in "40 to 87"; "3 of 12" for bools."""
-    if is_traced(values):
-        return "traced"
-    try:
-        array = np.asarray(values)
-        if array.dtype == bool:
-            return f"{array.sum()} of {array.size}"
-        # The range leaves NaN out; "nan" follows it.
-        present = array[~np.isnan(array)]
-        ends = [f"{end:.4g}" for end in (present.min(), present.max())] if present.size else []
-    except (TypeError, ValueError, RuntimeError):
-        return type(values).__name__
-    ranges = [" to ".join(dict.fromkeys(ends)), "nan" * (present.size < array.size)]
-    return " or ".join(filter(None, ranges)) or "empty"
-
-
 def summary(name: str, parts: Iterable[str]) -> str:
     """Return ``name(part, part, ...)``, on as many lines as needed."""
     return "\n".join(
@@ -363,19 +315,10 @@ def summary(name: str, parts: Iterable[str]) -> str:
     )
 
 
-def array_summary(arrays: Any, *axes: str) -> str:
-    """Return the type of a named tuple, the sizes of the ``axes`` of its arrays, and the range of
-    each.
-    """
+def array_summary(arrays: Any) -> str:
+    """Return the type of a named tuple, and the shapes of its arrays by name."""
     leaves = {name: leaf for name, leaf in arrays._asdict().items() if leaf is not None}
-    shapes = [leaf.shape for leaf in arrays if len(getattr(leaf, "shape", ())) == len(axes)]
-    # The largest size of each axis, as in "64 envs" and "1 joint".
-    largest = (max(lengths) for lengths in zip(*shapes, strict=True))
-    sizes = [
-        f"{n} {axis[: None if n != 1 else -1]}" for n, axis in zip(largest, axes, strict=False)
+    shapes = [
+        f"{name} {getattr(leaf, 'shape', type(leaf).__name__)}" for name, leaf in leaves.items()
     ]
-    ranges = [
-        f"{name} {type(leaf).__name__ if isinstance(leaf, tuple) else span(leaf)}"
-        for name, leaf in leaves.items()
-    ]
-    return summary(type(arrays).__name__, [*sizes, *ranges])
+    return summary(type(arrays).__name__, shapes)

@@ -103,7 +103,7 @@ class Coefficients(NamedTuple):
     """
 
     def __repr__(self) -> str:
-        return array_summary(self, "envs", "joints")
+        return array_summary(self)
 
 
 def discretise(params: PIDParams, dt: Array) -> Coefficients:

@@ -57,7 +57,7 @@ class Terms(NamedTuple):
     """The applied effort, which differs where a limit (of the effort or its rate) acts."""
 
     def __repr__(self) -> str:
-        return array_summary(self, "envs", "joints")
+        return array_summary(self)
 
 
 DRIVE_LACKS = (

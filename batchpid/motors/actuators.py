@@ -35,7 +35,7 @@ import numpy as np
 from batchpid.arrays.array_types import Array, Document, DType
 from batchpid.arrays.elementwise import clip, namespace, tiny_of
 from batchpid.arrays.field_tables import Field, declared, in_group
-from batchpid.arrays.records import LeafBuilder, Record, array_summary, with_fields
+from batchpid.arrays.records import LeafBuilder, Record, with_fields
 from batchpid.checks import entries, integer, is_traced
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.documents import RecordFile
@@ -154,9 +154,6 @@ class Actuators(Record, _ActuatorsFields):
                 "joints", "is missing, and every effect is off", remedy=remedy
             )
         return make_actuators(**{"joints": self.num_joints, **present, **options})
-
-    def __repr__(self) -> str:
-        return array_summary(self._replace(seed=None), "envs", "joints")
 
 
 @with_fields(*ACTUATOR_FIELDS)
@@ -306,30 +303,6 @@ class ActuatorState(Record, _ActuatorStateFields):
 
     __slots__ = ()
     NAME = "state"
-
-    def __repr__(self) -> str:
-        return array_summary(self._replace(key=None, step=None), "envs", "joints")
-
-    def matched_to(self, fresh: ActuatorState) -> ActuatorState:
-        """Return this state with exactly the leaves of ``fresh``: missing ones from there, the
-        others dropped.
-
-        A history that is longer there is continued by its oldest sample. The key is taken from
-        ``fresh``.
-        """
-        matched = super().matched_to(fresh)
-        histories = {
-            name: _resized(leaf, getattr(fresh, name)) for name, leaf in matched.leaves().items()
-        }
-        return matched._replace(**histories | {"key": fresh.key})
-
-
-def _resized(old: Array, new: Array) -> Array:
-    """Return a history of the length of another; other arrays as they are."""
-    if old.ndim < 3 or old.shape == new.shape:
-        return old
-    # Before its oldest sample a signal is taken as constant.
-    return old[:, np.minimum(np.arange(new.shape[1]), old.shape[1] - 1)]
 
 
 ACTUATORS = RecordFile(

@@ -45,7 +45,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from batchpid.arrays.array_types import Array
-from batchpid.arrays.elementwise import clip, exported, namespace, tiny_of
+from batchpid.arrays.elementwise import clip, namespace, tiny_of
 from batchpid.checks import check_time_step
 
 DEADBEAT_SHARE = 0.7
@@ -79,7 +79,6 @@ class Friction(NamedTuple):
         return None
 
 
-@exported
 class FrictionState(NamedTuple):
     """State of the model, arrays (envs, joints); None where there is no Coulomb friction."""
 

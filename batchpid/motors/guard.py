@@ -29,7 +29,7 @@ from collections.abc import Sequence
 from typing import Annotated, NamedTuple
 
 from batchpid.arrays.array_types import Array, ArrayModule, DType
-from batchpid.arrays.elementwise import TURN, clip, exported, in_dtype_of, namespace, wrap
+from batchpid.arrays.elementwise import TURN, clip, in_dtype_of, namespace, wrap
 from batchpid.arrays.field_tables import Field, declared
 from batchpid.arrays.records import LeafBuilder, Record, with_fields
 from batchpid.checks import check_time_step
@@ -63,7 +63,6 @@ class Guard(Record, _GuardFields):
     FIELDS = GUARD_FIELDS
 
 
-@exported
 class GuardState(NamedTuple):
     """State of the guard (envs, joints)."""
 

@@ -41,7 +41,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Pytree
-from batchpid.arrays.elementwise import exported, in_dtype_of, namespace, take_rows
+from batchpid.arrays.elementwise import in_dtype_of, namespace, take_rows
 from batchpid.arrays.trees import mapped
 from batchpid.checks import instance
 from batchpid.errors import InvalidArgumentError
@@ -60,7 +60,6 @@ cube of the time to it.
 """
 
 
-@exported
 class PlanState(NamedTuple):
     """State of a plan. Arrays are (envs, joints), tables (envs, horizon + 2, joints)."""
 

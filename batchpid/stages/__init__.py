@@ -139,13 +139,10 @@ def fit_stages(stages: Sequence[Stage]) -> tuple[Stage, ...]:
             problem = f"has a {type(stage).__name__}"
             remedy = "make it a frozen dataclass with the base batchpid.stages.Stage"
             raise InvalidArgumentError("stages", problem, remedy=remedy)
-        if stage.name in names:
-            problem = f"has a second stage {stage.name!r}"
-            raise InvalidArgumentError("stages", problem, remedy="give each a name of its own")
         places = [name for name in dict.fromkeys(names) if name != Last.name]
-        if stage.after not in places:
-            problem = f"has {stage.name!r} after {stage.after!r}, and no stage can stand there"
-            remedy = f"take one of {', '.join(places)}"
+        if stage.name in names or stage.after not in places:
+            problem = f"has a stage {stage.name!r} after {stage.after!r}"
+            remedy = f"give it a name of its own, and a place after one of {', '.join(places)}"
             raise InvalidArgumentError("stages", problem, remedy=remedy)
         names.append(stage.name)
         copies: Stage = mapped(lambda leaf: read_only(np.array(leaf)), stage)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from batchpid.arrays.array_types import Array
-from batchpid.arrays.elementwise import exported, namespace, replace_envs
+from batchpid.arrays.elementwise import namespace, replace_envs
 from batchpid.motors import friction as model
 from batchpid.motors.coupling import Coupling
 from batchpid.stages.control import Control
@@ -19,7 +19,6 @@ REFRESH_STEPS = 64
 """Sim steps of an env between updates of the friction model's inertia."""
 
 
-@exported
 class InertiaState(NamedTuple):
     """State of :class:`Inertia`."""
 
@@ -134,11 +133,6 @@ class Friction(Stage):
         qvel = values.measured.qvel
         state, qf = model.advance(self.friction, state, values.outputs.qf, qvel)
         return _kept(state), values.told(qf=qf)
-
-    def adopt(self, before: Self, state: model.FrictionState, values: Values) -> Any:
-        if (state.effort is None) == (self.friction.coulomb is None):
-            return state
-        return self.init(values)[0]
 
 
 def _with_inertia(state: model.FrictionState, values: Values) -> model.FrictionState:

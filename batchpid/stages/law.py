@@ -42,7 +42,7 @@ class Matrix(Stage):
     damping: Array
     coupling: Coupling
     timestep: Any
-    steps: int
+    every: int
     """Sim steps for which a matrix is kept within a tick."""
 
     name = "matrix"
@@ -58,10 +58,6 @@ class Matrix(Stage):
         inputs = control.armature, control.damping, control.coupling
         return cls(*inputs, control.timestep, steps)
 
-    @property
-    def every(self) -> int:
-        return self.steps
-
     def init(self, values: Values) -> Told:
         rows, dof = values.measured.qpos.shape
         return np.zeros((rows, dof, dof)), values
@@ -71,10 +67,10 @@ class Matrix(Stage):
         index, end, _ = values.step
 
         def fresh() -> Array:
-            steps = namespace(qpos).minimum(self.steps, end - index).astype(qpos.dtype)
+            steps = namespace(qpos).minimum(self.every, end - index).astype(qpos.dtype)
             return self.at(qpos + 0.5 * (steps - 1) * self.timestep * qvel, values)
 
-        state = values.model.when(index % self.steps == 0, fresh, state)
+        state = values.model.when(index % self.every == 0, fresh, state)
         return state, values._replace(matrix=state)
 
     def at(self, qpos: Array, values: Values) -> Array:
@@ -88,7 +84,7 @@ class Matrix(Stage):
         return self.coupling.mass_matrix(matrix)
 
     def bind(self, program: Any, state: Array, values: Values) -> Values:
-        tree, bodies = program.pack.force_model.tables
+        tree, bodies = program.pack.spec.rigid_tree.tables
         program.place(
             pose=values.seen.qpos,
             rate=values.seen.qvel,

@@ -39,6 +39,8 @@ class Stage:
     """Name of the stage before it, for a stage of the caller's."""
     native: ClassVar[str] = ""
     """Entry of StageKind in tick.h that replaces ``step`` in native code; "": a trace of ``step`` runs."""
+    every = 1
+    """Sim steps of a tick from one run of a native stage to the next."""
     calls_model: ClassVar[bool] = False
     """Whether ``step`` calls functions of the robots' model, which no program has."""
     is_brief: ClassVar[bool] = False
@@ -56,11 +58,6 @@ class Stage:
         are made by the caller.
         """
         raise NotImplementedError
-
-    @property
-    def every(self) -> int:
-        """Sim steps of a tick from one run of a native stage to the next."""
-        return 1
 
     def init(self, values: Values) -> Told:
         """Return the state of envs at their start, and the values for the stages after it."""

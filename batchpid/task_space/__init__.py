@@ -22,7 +22,6 @@ from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.tree_quantities import (
     bias,
     forward_dynamics,
-    gravity,
     inverse_dynamics,
     jacobian,
     jacobian_rate,
@@ -41,7 +40,6 @@ __all__ = [
     "Tool",
     "bias",
     "forward_dynamics",
-    "gravity",
     "init",
     "inverse_dynamics",
     "inverse_kinematics",

@@ -23,6 +23,7 @@ from batchpid.arrays.array_types import Array, Document, Float64
 from batchpid.arrays.elementwise import namespace
 from batchpid.native.array_program import SWITCH, obstacle
 from batchpid.native.extensions import KINEMATICS, LAW, TASK_SPACE, load
+from batchpid.task_space.frames import rotate
 from batchpid.task_space.osc_params import OSCParams
 from batchpid.task_space.osc_state import (
     OSCInputs,
@@ -77,9 +78,9 @@ def kinematics(
     tree: RigidTree,
     wanted: tuple[str, ...],
     qpos: Array,
-    qvel: Array = None,
-    index: int = 0,
-    point: Array = None,
+    qvel: Array,
+    index: int,
+    point: Array,
 ) -> dict[str, Float64] | None:
     """Return the ``wanted`` arrays (..., ...), of "pose", "jacobian", "jacobian_rate",
     "mass_matrix" and "bias".
@@ -294,7 +295,7 @@ def tool_frames(tree: RigidTree, index: int, point: Array) -> Float64:
     frames = tree.bodies.link_frames[index]
     if point is not None:
         frames = np.broadcast_to(frames, (*point.shape[:-1], 3, 4)).copy()
-        frames[..., 3] += (frames[..., :3] * point[..., None, :]).sum(-1)
+        frames[..., 3] += rotate(frames[..., :3], point)
     rows: Float64 = frames.reshape(-1, 12)
     return rows
 

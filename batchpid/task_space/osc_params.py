@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import CHOICES, Array
-from batchpid.arrays.elementwise import TURN, exported
+from batchpid.arrays.elementwise import TURN
 from batchpid.arrays.field_tables import Field
 from batchpid.arrays.records import LeafBuilder, array_summary, with_fields
 from batchpid.checks import AxisKind, choice, instance, read_array, time_step
@@ -55,7 +55,6 @@ OSC_FIELDS = {
 """Options with a value for each axis or joint, or one for each env."""
 
 
-@exported
 class OSCParams(NamedTuple):
     """Parameters of operational-space control at a time step, for one tool of one kind of robot.
     Build them with :func:`make_osc_params`.
@@ -104,7 +103,7 @@ class OSCParams(NamedTuple):
     """
 
     def __repr__(self) -> str:
-        return array_summary(self, "envs", "axes")
+        return array_summary(self)
 
 
 @with_fields(*OSC_FIELDS)

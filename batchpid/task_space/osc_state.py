@@ -5,8 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from batchpid.arrays.array_types import Array
-from batchpid.arrays.elementwise import exported
-from batchpid.arrays.records import array_summary
 from batchpid.task_space.rigid_tree import RigidTree
 
 
@@ -37,9 +35,6 @@ class OSCInputs(NamedTuple):
     feedforward: Array = None
     """Effort added (envs, dof), such as the effort of viscous damping [N m or N]."""
 
-    def __repr__(self) -> str:
-        return array_summary(self, "envs", "columns")
-
 
 class TaskDynamics(NamedTuple):
     """Dynamics of a robot and its tool at present positions and velocities, from
@@ -60,7 +55,6 @@ class TaskDynamics(NamedTuple):
     """1.0 for the joints between the base and the tool, else 0.0 (dof,)."""
 
 
-@exported
 class OSCState(NamedTuple):
     """State of the law."""
 
@@ -69,9 +63,6 @@ class OSCState(NamedTuple):
     integral: Array = None
     """I (envs, 6): acceleration of the task [m/s^2, rad/s^2]. None without
     ``integral_gain``."""
-
-    def __repr__(self) -> str:
-        return array_summary(self, "envs", "joints")
 
 
 class OSCTerms(NamedTuple):
@@ -97,6 +88,3 @@ class OSCTerms(NamedTuple):
     """Bool (envs,): an eigenvalue of A is below s0, so that some direction has lost stiffness; True
     for NaN.
     """
-
-    def __repr__(self) -> str:
-        return array_summary(self, "envs", "joints")

@@ -26,6 +26,8 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
 from batchpid.task_space.frames import (
     SpatialInertia,
+    about,
+    compose,
     inertia_rows,
     matrix_of,
     moved_matrix,
@@ -33,7 +35,6 @@ from batchpid.task_space.frames import (
     spatial_matrix,
     total,
     turned,
-    wxyz_of,
 )
 
 GRAVITY = (0.0, 0.0, -9.81)
@@ -211,12 +212,10 @@ class RigidTree:
         above = np.flatnonzero(types != "fixed")
         # A fixed joint is the same joint with its motion multiplied into its place.
         for link, q in zip(above[~moves], np.asarray(qpos)[~moves], strict=True):
-            turn = matrix_of(wxyz[link])
             if types[link] == "revolute":
-                half = np.array([np.cos(0.5 * q), *np.sin(0.5 * q) * self.axis[link]])
-                wxyz[link] = wxyz_of(turn @ matrix_of(half))
+                wxyz[link] = compose(wxyz[link], about(self.axis[link], q))
             else:
-                position[link] += q * turn @ self.axis[link]
+                position[link] += q * matrix_of(wxyz[link]) @ self.axis[link]
             types[link] = "fixed"
         names = tuple(compress(self.joint_names, moves))
         rows = {name: getattr(self, name)[moves] for name in ("armature", "lower", "upper")}

@@ -58,24 +58,17 @@ def prepared(tree: RigidTree, **arrays: Array) -> tuple[list[Array], Bodies, Arr
     """
     instance("tree", tree, RigidTree, MAKE_TREE)
     xp = namespace(*arrays.values())
-    checked = []
-    shape = None
+    checked: list[Array] = []
     for name, value in arrays.items():
-        if xp is not np or is_traced(value):
-            array = value
-        else:
+        array = value
+        if xp is np and not is_traced(value):
             array = read_array(name, value).astype(np.float64, copy=False)
-        if array.ndim < 1 or array.shape[-1] != tree.dof:
+        # All are for the same envs.
+        like = checked[0] if checked else array
+        shape = (*like.shape[:-1], tree.dof)
+        if array.shape != shape:
             remedy = f"the last axis counts the joints {', '.join(tree.joint_names)}"
-            raise InvalidArgumentError(
-                name, f"has shape {array.shape}, not (..., {tree.dof})", remedy=remedy
-            )
-        if shape is not None and array.shape != shape:
-            remedy = "give both for the same envs"
-            raise InvalidArgumentError(
-                name, f"has shape {array.shape}, but the first has {shape}", remedy=remedy
-            )
-        shape = array.shape
+            raise InvalidArgumentError(name, f"has shape {array.shape}, not {shape}", remedy=remedy)
         checked.append(array)
     if xp is np:
         return checked, tree.bodies, xp

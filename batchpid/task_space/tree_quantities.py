@@ -336,14 +336,6 @@ def bias(
     )["bias"]
 
 
-def gravity(tree: RigidTree, qpos: Array) -> Array:
-    """Return the efforts (..., dof) [N m or N] that hold the robot at ``qpos`` (..., dof): h(q,
-    0).
-    """
-    (q,), *_ = prepared(tree, qpos=qpos)
-    return bias(tree, q, 0 * q)
-
-
 def inverse_dynamics(
     tree: RigidTree,
     qpos: Array,

@@ -159,7 +159,7 @@ def plot(
     recording: Annotated[
         Path,
         tyro.conf.Positional,
-        flag("File that `batchpid rollout --out` or a batchpid.sim.Recorder wrote, .h5."),
+        flag("File that `batchpid rollout --out` or batchpid.sim.write_recording wrote, .h5."),
     ],
     robot: Robot | None = None,
     kind: Annotated[
@@ -167,18 +167,13 @@ def plot(
         flag("Step responses, efforts against their limits, or errors of following."),
     ] = "responses",
 ) -> Recording:
-    """Draw a recorded run, or film it.
-
-    The recording may be complete, cut short by a kill, or still being written. A film draws
-    the robot of the recording, or the one that is named.
-    """
+    """Draw a recorded run, or film it: the robot of the recording, or the one that is named."""
     return Recording(recording, read_recording(recording), robot, kind)
 
 
 def recording_line(path: Path, rollout: Rollout) -> str:
     """Return a line about a recorded run."""
-    cut = "" if rollout.info.complete else " (cut short)"
-    return f"{path}{cut}: {rollout.info.robot}, {rollout!r}"
+    return f"{path}: {rollout.info.robot}, {rollout!r}"
 
 
 def view(

@@ -24,7 +24,7 @@ leader shake a whole arm, or make it diverge. See docs/joints.md.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +34,7 @@ from batchpid.arrays.elementwise import TURN, matrix_vector
 from batchpid.motors.coupling import Coupling
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import structure
-from batchpid.sim.engine.native_model import NativeModel
+from batchpid.sim.engine.native_model import NativeModel, TreeModel
 
 RATE_GAIN, POSITION_GAIN = 0.5, 0.25
 """Gains of c' dt and c in units of 1 / dt^2."""
@@ -46,10 +46,11 @@ class ConstraintEfforts:
     """Constraint efforts of robots with the coupling ``coupling``; positions of the joints
     ``wraps`` (dof,) jump.
 
-    Arrays are (robots, dof). :meth:`update` comes before the first :meth:`apply`. Native code
-    applies and updates the efforts by the structure at :attr:`address`; it writes the efforts
-    without the constraint's into ``asked``, if given. Where positions jump, call :meth:`place`
-    after every reset of positions.
+    Arrays are (robots, dof). :meth:`update` comes before the first :meth:`apply`. Mass matrices are
+    those of ``model``. Native code applies and updates the efforts by the structure at
+    :attr:`address`, within a tick too, with passive forces of ``force``, or with the engine's for
+    None; it writes the efforts without the constraint's into ``asked``, if given. Where positions
+    jump, call :meth:`place` after every reset of positions.
 
     Attributes
     ----------
@@ -68,6 +69,8 @@ class ConstraintEfforts:
         coupling: Coupling,
         wraps: Bool,
         timestep: float,
+        model: TreeModel,
+        force: TreeModel | None,
         asked: Float32 | None = None,
     ) -> None:
         joints = len(coupling.leader)
@@ -84,7 +87,7 @@ class ConstraintEfforts:
             np.zeros((robots, joints)),
         )
         self.implicit = np.zeros((robots, joints))
-        self._model: NativeModel | None = None
+        self._model = model
         arrays: dict[str, Rows] = {
             "response": self._response,
             "push": self._push,
@@ -105,43 +108,30 @@ class ConstraintEfforts:
             size=len(followers),
             **{name: array.ctypes.data for name, array in arrays.items()},
         )
-        self._kept = arrays
+        if isinstance(model, NativeModel):
+            self._native.model = model.address
+        if isinstance(force, NativeModel):
+            self._native.force = force.address
+        self._kept = arrays, force
 
     @property
     def address(self) -> int:
         """Address of the constraint, for a group of the extension."""
         return ctypes.addressof(self._native)
 
-    def use(self, model: NativeModel, force: NativeModel | None) -> None:
-        """Update in native code, within a tick too, with mass matrices of ``model`` and passive
-        forces of ``force``.
-
-        None: the passive forces are the engine's own.
-        """
-        self._model, self._force = model, force
-        self._native.model = model.address
-        self._native.force = None if force is None else force.address
-
-    def update(
-        self,
-        mass_matrix: Callable[[Float64], Float64],
-        qpos: Float64,
-        passive: Float64,
-        rows: Sequence[int] | slice,
-    ) -> None:
+    def update(self, qpos: Float64, passive: Float64, rows: Sequence[int] | slice) -> None:
         """Set mass matrix and passive force of robots ``rows``, at positions and passive forces of
         all robots.
-
-        ``mass_matrix`` is a function of positions; native code does not need it.
         """
-        # Native code has the mass matrices of its own model.
-        if self._model is not None:
+        if isinstance(self._model, NativeModel):
             mask = np.zeros(len(qpos), bool)
             mask[rows] = True
             arrays = (np.ascontiguousarray(table, np.float64) for table in (qpos, passive))
             native.extension("_gateway").update_constraint(self.address, *arrays, mask, len(qpos))
             return
-        matrices = (mass_matrix(qpos) + self.implicit[:, None] * np.eye(qpos.shape[1]))[rows]
+        matrices = (self._model.mass_matrix(qpos) + self.implicit[:, None] * np.eye(qpos.shape[1]))[
+            rows
+        ]
         numbers = np.concatenate([matrices, passive[rows][:, :, None]], axis=2)
         sound = np.isfinite(numbers).all((1, 2), keepdims=True)  # a robot may have failed
         matrix = np.where(sound, matrices, np.eye(qpos.shape[1]))

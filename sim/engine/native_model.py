@@ -13,7 +13,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Array, Float64, Rows
@@ -143,11 +142,6 @@ class NativeModel(TreeModel):
             **numbers,
             **addresses,
         ), arrays
-
-    @property
-    def tables(self) -> tuple[NDArray[np.int32], Float64]:
-        """Tables of the tree: :attr:`.RigidTree.tables`."""
-        return self._tree.tables
 
     @property
     def address(self) -> int:

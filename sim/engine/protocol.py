@@ -20,11 +20,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from batchpid.arrays.array_types import Bool, Float64, Rows
+from batchpid.arrays.array_types import Bool, Float32, Float64, Rows
 from batchpid.checks import choice
 from batchpid.errors import InvalidArgumentError, MissingDependencyError, SingleOwner
 from batchpid.io.files import imported
 from batchpid.motors import Actuators
+from batchpid.sim.description.merging import coupling_of
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.native_model import NativeModel, NativeStep, TreeModel
 from batchpid.sim.engine.scene_spec import (
@@ -77,8 +78,6 @@ class EnginePack(SingleOwner, ABC):
         :attr:`joint_model`.
     steps_natively
         Whether native code does the sim steps, by :meth:`compiled_step`.
-    content
-        Digest of the content that the user's ``build`` added to each env (M,); empty without one.
     calls
         Object that is replaced when earlier results of :meth:`compiled_step` become invalid.
     """
@@ -101,7 +100,6 @@ class EnginePack(SingleOwner, ABC):
         self.dof, self._variation = len(spec.joints), variation or Variation()
         self._masses = VariedMasses(spec, size, self._variation)
         self._suspended: Bool = np.zeros(size, bool)
-        self.content = np.zeros(0, np.int64)
         self.friction = own_friction(spec, self._variation)
         armature = self._variation.armature  # vary() changes its rows
         self.armature = self._motors = np.zeros((1, self.dof)) if armature is None else armature
@@ -138,6 +136,29 @@ class EnginePack(SingleOwner, ABC):
         """Return the passive force of a model at the present state."""
         state = self.read_qpos(), self.read_qvel(), gravity, coriolis, self.read_base_motion()
         return model.passive_force(*state)
+
+    def _couple(self, wraps: Bool, force: TreeModel | None, asked: Float32 | None = None) -> None:
+        """Make the constraint efforts, if joints are coupled: see :class:`.ConstraintEfforts`."""
+        coupling = coupling_of(self.spec.joints)
+        if coupling.is_identity:
+            return
+        self._constraint = ConstraintEfforts(
+            self.size,
+            coupling,
+            wraps,
+            self.spec.timestep,
+            self.joint_model,
+            force,
+            asked,
+        )
+        self._add_joints(None)
+
+    def update_constraint(self, rows: Sequence[int] | slice = slice(None)) -> None:
+        """Update the mass matrix in the constraint efforts of robots ``rows``, if joints are
+        coupled.
+        """
+        if self._constraint is not None:
+            self._constraint.update(self.read_qpos(), self._bias(), rows)
 
     @property
     def _constraint_address(self) -> int | None:
@@ -193,9 +214,9 @@ class EnginePack(SingleOwner, ABC):
         """Apply joint efforts [N m or N]. They persist until written again."""
 
     @abstractmethod
-    def update_constraint(self, rows: Sequence[int] | slice = slice(None)) -> None:
-        """Update the mass matrix in the constraint efforts of robots ``rows``, if joints are
-        coupled.
+    def _bias(self) -> Float64:
+        """Return the forces in the equations of motion of the joints (M, dof), for the constraint
+        efforts.
         """
 
     @abstractmethod

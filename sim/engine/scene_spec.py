@@ -85,10 +85,8 @@ SOLVERS = {
 
 
 Build = Callable[[Any, int], Any]
-"""``build(scene, env)`` adds content to the engine's scene of env ``env``; returns objects whose
-poses are read.
-
-An object is an entity or the name of a link of the robot, merged links included. None: no poses.
+"""``build(scene, env)`` adds actors to the engine's scene of env ``env``; returns those whose poses
+are read, or None.
 """
 
 
@@ -102,7 +100,8 @@ class SceneSpec:
     scenes have no collision shapes and no ground, but the same masses and inertias. ``mjcf`` is the
     file that MuJoCo compiles in place of ``tables``. ``contacts`` and ``wrenches`` are links with
     sensors. ``carrier`` is the link that carries payloads, and ``varied_links`` are those whose mass
-    or center of mass varies. Specs that differ in ``build`` alone are equal.
+    or center of mass varies. With ``drives`` the engine's drives move the joints. Specs that differ
+    in ``build`` alone are equal.
     """
 
     tables: Tables
@@ -121,6 +120,7 @@ class SceneSpec:
     mjcf: MjcfFile | None = None
     carrier: str = ""
     varied_links: tuple[str, ...] = ()
+    drives: bool = False
 
     @property
     def simulated(self) -> Tables:

@@ -52,8 +52,7 @@ class ReachVectorEnv(RobotVectorEnv):
     - *Info*: "success", "error" (largest |goal - qpos|), "diverged".
 
     A continuous joint has the range [-pi, pi]. Its qpos and goal are observed in that range, its
-    error is the short way round, and increments move it past pi if the law can (control "pid" with
-    ``continuous`` in its params). Another joint without limits has the range of half a turn, or pi
+    error is the short way round. Another joint without limits has the range of half a turn, or pi
     m, on either side of its start.
 
     Parameters
@@ -96,16 +95,6 @@ class ReachVectorEnv(RobotVectorEnv):
             self.close()
             problem = "takes no joint setpoints"
             raise InvalidArgumentError("control", problem, remedy="subclass RobotVectorEnv")
-        # Only a law that takes errors the short way round follows a setpoint past pi.
-        self._setpoint_turns = None
-        params = self.runner.params
-        if (
-            self._turns is not None
-            and self.runner.control == "pid"
-            and params.continuous is not None
-        ):
-            continuous = np.asarray(params.continuous, np.float64).min(0)
-            self._setpoint_turns = np.minimum(self._turns, continuous[self._index] / TURN)
         self._goal = np.zeros((self.num_envs, len(self.joint_names)))
         self._error = np.zeros_like(self._goal)  # of the last observation: success comes first
 
@@ -115,7 +104,7 @@ class ReachVectorEnv(RobotVectorEnv):
         self._index = index = np.flatnonzero(robot.independent)
         self.joint_names = tuple(robot.joint_names[joint] for joint in index)
         continuous = robot.continuous[index]
-        # Periods for wrap: 1 / (2 pi) for continuous joints, else 0.
+        # Turns per rad, for wrap: 1 / (2 pi) for continuous joints, else 0.
         self._turns = continuous / TURN if continuous.any() else None
         self._start = wrap(robot.start[index], self._turns, np)
         # Every joint has a finite range: a space needs bounds.
@@ -156,16 +145,13 @@ class ReachVectorEnv(RobotVectorEnv):
         if self.actions == "setpoint":
             return self._of_robot(self.low + (action + 1) / 2 * (self.high - self.low))
         moved = setpoint[:, self._index] + action * self.max_increment
-        return self._of_robot(np.clip(wrap(moved, self._setpoint_turns, np), self.low, self.high))
+        return self._of_robot(np.clip(moved, self.low, self.high))
 
     def rate(self, setpoint: Float64, last: Float64) -> Float64 | None:
-        """Return the rates of increments, the short way round on continuous joints; None for other
-        actions.
-        """
+        """Return the rates of increments; None for other actions."""
         if self.actions == "setpoint":
             return None
-        change = wrap((setpoint - last)[:, self._index], self._setpoint_turns, np)
-        return self._of_robot(change / self.step_seconds)
+        return (setpoint - last) / self.step_seconds
 
     def observe(self, observed: Observation) -> Float32:
         """Return qpos, qvel, pose and twist of a floating base, goal, and with chunks the setpoint."""

@@ -6,12 +6,11 @@ from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.array_types import Document, Float32
 from batchpid.errors import SingleOwner
-from batchpid.sim.gym.robot_vector_env import RobotVectorEnv, check_free
+from batchpid.sim.gym.robot_vector_env import RobotVectorEnv
 from batchpid.sim.robot.robot import Robot
 
 
@@ -33,18 +32,13 @@ class RobotEnv(SingleOwner, gymnasium.Env):
     ) -> None:
         if robot is not None:
             options["robot"] = robot
-        options.setdefault("workers", 0)
         # gymnasium.make adds the time limit and the resets.
-        chosen: Document = {
-            "num_envs": 1,
-            "max_episode_steps": None,
-            "autoreset_mode": AutoresetMode.DISABLED,
-        }
-        check_free(self, options, chosen)
         self._envs = self.task(
+            num_envs=1,
+            max_episode_steps=None,
+            autoreset_mode="Disabled",
             render_mode=render_mode,
-            **chosen,
-            **options,
+            **{"workers": 0, **options},
         )
         self.runner = self._envs.runner
         self.render_mode = render_mode

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from inspect import signature
 from typing import Any, ClassVar
 
 import numpy as np
@@ -20,20 +19,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.array_types import Bool, Document, Float32, Float64, Rows
 from batchpid.checks import array, check_keywords, choice, env_mask, flag, integer, number
-from batchpid.errors import CallOrderError, InvalidArgumentError, SingleOwner
+from batchpid.errors import InvalidArgumentError, SingleOwner
 from batchpid.plan import make_plan
-from batchpid.sim.options.options import OPTIONS, RunnerOptions, checked_option
-from batchpid.sim.randomization.randomization import LARGEST_SEED
+from batchpid.sim.options.options import RunnerOptions, checked_option
+from batchpid.sim.randomization.randomization import env_streams
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner.runner import Runner
 from batchpid.sim.signals import Observation
-
-
-def check_free(owner: object, options: Document, chosen: Document) -> None:
-    """Raise InvalidArgumentError for an option among those that ``owner`` has chosen."""
-    for option in options.keys() & chosen.keys():
-        problem = f"is set by {type(owner).__name__}"
-        raise InvalidArgumentError(option, problem, remedy="leave it out, or make a subclass")
 
 
 class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
@@ -46,11 +38,8 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
 
     - :meth:`spaces`: spaces of observation and action of one env; called once, before the runner
       starts;
-    - :meth:`runner_options`: options of the runner that belong to the task, such as ``control`` and
-      ``build``;
     - :meth:`draw`: the start and the goal of an episode, drawn for one env;
-    - :meth:`first_setpoint`, :meth:`command`: the setpoint at the start of an episode, and for an
-      action;
+    - :meth:`command`: the setpoint for an action;
     - :meth:`rate`: the rate of a setpoint that moves;
     - :meth:`observe`: the observation, made from the runner's;
     - :meth:`success`, :meth:`reward`, :meth:`terminated`, :meth:`info`: results, from the
@@ -73,7 +62,8 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
     max_episode_steps
         Steps after which an episode is truncated; None: never.
     autoreset_mode
-        Of :class:`gymnasium.vector.AutoresetMode`.
+        "NextStep": the step after the end of an episode begins the next one; "Disabled":
+        ``reset(options={"reset_mask": terminated | truncated})`` does.
     render_mode
         ``"rgb_array"``: :meth:`render` returns pictures.
     chunk
@@ -86,13 +76,13 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         Least and largest time after which a chunk takes effect [s], at most the time of a step;
         drawn for each env and episode, and rounded up to whole rows, but less than a step.
     options
-        Of :class:`batchpid.sim.Runner`: params, workers, timestep, physics, compensate, build,
-        randomization, ...
+        Of :class:`batchpid.sim.Runner`, to which a task adds its own, such as ``control`` and
+        ``build``.
 
     Raises
     ------
     InvalidArgumentError
-        An argument is out of range, is unknown, or is chosen by the task.
+        An argument is out of range or unknown.
     """
 
     instead = "make another env with the same arguments"
@@ -136,7 +126,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         if max_episode_steps is not None:
             integer("max_episode_steps", max_episode_steps, 1, 10**9)
         mode = getattr(autoreset_mode, "value", autoreset_mode)
-        modes = [mode.value for mode in AutoresetMode]
+        modes = [AutoresetMode.NEXT_STEP.value, AutoresetMode.DISABLED.value]
         self.autoreset_mode = AutoresetMode(choice("autoreset_mode", mode, modes))
         self.render_mode = render_mode
         if render_mode is not None:
@@ -146,10 +136,6 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         rate = number("rate_hz", rate_hz, 1e-3, 1 / timestep, "actions per second")
         substeps = round(1 / (rate * timestep))
         self.step_seconds = substeps * timestep
-        chosen = {"substeps": substeps, **self.runner_options()}
-        check_free(self, options, chosen)
-        arguments = {**signature(type(self)).parameters, **signature(RobotVectorEnv).parameters}
-        check_keywords(type(self).__name__, options, {**arguments, **OPTIONS})
         self._period, self._rows, self._ticks = self.step_seconds, chunk, 1
         # Spaces come first: an invalid one is an error before any process starts.
         self.single_observation_space, self.single_action_space = self.spaces()
@@ -174,20 +160,19 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         elif execute is not None or np.any(latency):
             name = "latency" if execute is None else "execute"
             raise InvalidArgumentError(name, "has no effect without chunks", remedy="give chunk=")
-        low, high = array("latency", latency, (1, 2), ("least", "largest"), kind="entry")[0]
+        shortest, longest = latency
         self._latency = [
-            number("latency", low, 0.0, high, "s"),
-            number("latency", high, 0.0, self.step_seconds, "s"),
+            number("latency", shortest, 0.0, longest, "s"),
+            number("latency", longest, 0.0, self.step_seconds, "s"),
         ]
         self._waits = np.zeros(self.num_envs, np.int64)
-        self._later: list[Document] = []  # ticks of the step that have not begun
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.metadata = {  # type: ignore[misc]
             **type(self).metadata,
             "render_fps": 1 / self.step_seconds,
             "autoreset_mode": self.autoreset_mode,
         }
-        self.runner = Runner(self.robot, self.num_envs, **options, **chosen)
+        self.runner = Runner(self.robot, self.num_envs, substeps=substeps, **options)
         self._generators = np.random.default_rng().spawn(self.num_envs)
         self._starts = np.tile(self.robot.start, (self.num_envs, 1))
         self.setpoint = np.zeros((self.num_envs, self.runner.command.size))
@@ -198,7 +183,6 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         self._diverged = np.zeros(self.num_envs, bool)
         self._steps = np.zeros(self.num_envs, np.int64)
         self._done = np.ones(self.num_envs, bool)
-        self._is_stepping = False
 
     # -- hooks
     # ----------------------------------------------------------------------------------------------
@@ -211,12 +195,6 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         Actions are clipped to their space, and observations to theirs.
         """
 
-    def runner_options(self) -> Document:
-        """Return the options of the Runner that belong to the task; the caller cannot give these.
-        Default: none.
-        """
-        return {}
-
     def draw(self, env: int, random: np.random.Generator) -> ArrayLike:
         """Draw an episode of one env: keep its goal, and return the joint positions at its start
         (dof,) [rad or m].
@@ -225,17 +203,6 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         ``robot.start``.
         """
         return self.robot.start
-
-    def first_setpoint(self, qpos: Float64) -> ArrayLike:
-        """Return the setpoints (envs, command size) at the start of an episode from ``qpos`` (envs,
-        dof).
-
-        Default: ``qpos`` where setpoints are joint positions, else the neutral setpoint of the
-        command.
-        """
-        if self.runner.options.sets_positions:
-            return qpos
-        return np.broadcast_to(self.runner.command.neutral, self.setpoint.shape)
 
     def command(self, action: Float64, setpoint: Float64) -> ArrayLike:
         """Return the setpoints of the Runner (envs, command size) for the actions (envs, size).
@@ -300,53 +267,33 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
 
         Raises
         ------
-        CallOrderError
-            A step was begun and has not been waited for.
         InvalidArgumentError
             A seed is negative or no int, or an option is unknown.
         """
-        self._expect_no_step("reset")
         options = options or {}
         check_keywords("reset(options=)", options, ("reset_mask",))
         mask = np.ones(self.num_envs, bool)
         if "reset_mask" in options:
             mask = env_mask("options['reset_mask']", options["reset_mask"], self.num_envs)
-        seeds: list[int] | None = None
-        if seed is not None:
-            if np.ndim(seed) == 0:
-                first = integer("seed", seed, 0, LARGEST_SEED - self.num_envs)
-                seed = range(first, first + self.num_envs)
-            seeds = [integer("seed", entry, 0, LARGEST_SEED) for entry in seed]  # type: ignore[union-attr]
-            if len(seeds) != self.num_envs:
-                problem = f"has {len(seeds)} entries for {self.num_envs} envs"
-                remedy = "give an int, or one for each env"
-                raise InvalidArgumentError("seed", problem, remedy=remedy)
+        seeds = None if seed is None else env_streams(seed, self.num_envs)
         self._begin(mask, seeds)
         return self._observation.copy(), self._info(mask)
 
     def step(self, actions: ArrayLike) -> tuple[Float32, Float64, Bool, Bool, Document]:
         """Apply an action (envs, size) for one step; return observation, reward, terminated,
         truncated and info.
-        """
-        self.step_async(actions)
-        return self.step_wait()
-
-    def step_async(self, actions: ArrayLike) -> None:
-        """Begin a step and return; the workers run it while the caller computes something else.
 
         Raises
         ------
-        CallOrderError
-            The last step that was begun has not been waited for.
+        gymnasium.error.ResetNeeded
+            An episode has ended, and there is no autoreset.
         """
-        self._expect_no_step("step_async")
         space: Any = self.single_action_space
         shape = self.action_space.shape or ()
         action = array("actions", actions, shape, self._action_names, kind="entry")
         action = np.clip(action, space.low, space.high)
         begins, last = self._done, self.setpoint
-        holds = begins.any()
-        if holds and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
+        if begins.any() and self.autoreset_mode is AutoresetMode.DISABLED:
             raise error.ResetNeeded(
                 f"env {int(np.argmax(begins))} has ended; reset it before the next step"
             )
@@ -354,58 +301,19 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         if self._rows is not None:
             rows = list(action.swapaxes(0, 1))
         for row in rows:
-            moved = self.command(row, setpoints[-1])
-            setpoints.append(self._returned("command", moved, last.shape))
-        setpoint = setpoints[self._ticks]
-        # In next-step mode an ended env holds its setpoint: step_wait begins its next episode.
-        if holds:
-            setpoint = np.where(begins[:, None], last, setpoint)
+            setpoints.append(np.asarray(self.command(row, setpoints[-1])))
+        # In next-step mode an ended env holds its setpoint: this step begins its next episode.
+        setpoint = np.where(begins[:, None], last, setpoints[self._ticks])
         if self._rows is None:
-            first: Document = {"setpoint": setpoint, "setpoint_rate": self.rate(setpoint, last)}
-            if first["setpoint_rate"] is not None:
-                rate = self._returned("rate", first["setpoint_rate"], last.shape)
-                first["setpoint_rate"] = np.where(begins[:, None], 0.0, rate)
+            rate = self.rate(setpoint, last)
+            if rate is not None:
+                rate = np.where(begins[:, None], 0.0, rate)
+            observed = self.runner.step(setpoint, setpoint_rate=rate)
         else:
-            first, *self._later = self._chunks(rows, setpoints)
-        self._first = first
+            observed = self._execute(setpoints)
         self.action = rows[self._ticks - 1]
         self.setpoint = setpoint
-        self._is_stepping = True
-
-    def _chunks(self, rows: Sequence[Float64], setpoints: Sequence[Float64]) -> list[Document]:
-        """Return the arguments of the ticks of a step: the chunk with its age where it enters."""
-        if self._ticks < len(rows) and not np.array_equal(
-            self.command(rows[0], setpoints[0]), setpoints[1]
-        ):
-            problem = (
-                f"{type(self).__name__}.command gives another setpoint when it is called again"
-            )
-            remedy = "leave execute out, or let command depend on action and setpoint alone"
-            raise InvalidArgumentError("execute", problem, remedy=remedy)
-        assert self.runner.options.plan is not None
-        held = self.runner.options.plan.horizon - len(setpoints)
-        chunk = np.stack(list(setpoints) + held * [setpoints[-1]], 1)
-        waits = np.where(self._done, -1, self._waits)  # envs that begin get none
-        ages = [np.where(waits == tick, tick * self._period, np.inf) for tick in range(self._ticks)]
-        return [{"setpoint": chunk, "latency": age} for age in ages]
-
-    def step_wait(self) -> tuple[Float32, Float64, Bool, Bool, Document]:
-        """Wait for the step that :meth:`step_async` began; return what :meth:`step` returns.
-
-        Raises
-        ------
-        CallOrderError
-            No step was begun.
-        """
-        if not self._is_stepping:
-            raise CallOrderError("step_wait: no step is under way; call step_async(actions) first")
-        observed = self.runner.step(**self._first)
-        while self._later:
-            observed = self.runner.step(**self._later.pop(0))
-        # From here on the step has ended, even if a hook of the task raises.
-        self._is_stepping = False
         self._observe(observed)
-        begins = self._done
         self._steps += 1
         observation, success = self._observation, self._success
         count = success.shape
@@ -416,38 +324,33 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         if self.max_episode_steps is not None:
             truncated = self._steps >= self.max_episode_steps
         if begins.any():
-            # In next-step mode this step began the next episode: it has no result.
+            # This step has no result for them.
             self._begin(begins)
             reward = np.where(begins, 0.0, reward)
             terminated = terminated & ~begins
             truncated = truncated & ~begins
-        self._done = done = terminated | truncated
-        everywhere = np.ones(count, bool)
-        info = self._info(everywhere)
-        if done.any() and self.autoreset_mode is AutoresetMode.SAME_STEP:
-            # Results of the ended episodes, before the next ones begin.
-            final = np.full(count, None, object)
-            for env in np.flatnonzero(done):
-                final[env] = self._observation[env].copy()
-            info = {"final_obs": final, "_final_obs": done}
-            info |= {"final_info": self._info(done), "_final_info": done}
-            self._begin(done)
-            info |= self._info(everywhere)
+        self._done = terminated | truncated
+        info = self._info(np.ones(count, bool))
         return self._observation.copy(), reward, terminated, truncated, info
+
+    def _execute(self, setpoints: list[Float64]) -> Observation:
+        """Run the ticks of a step: the chunk of ``setpoints`` enters with its age."""
+        assert self.runner.options.plan is not None
+        held = self.runner.options.plan.horizon - len(setpoints)
+        chunk = np.stack(setpoints + held * [setpoints[-1]], 1)
+        waits = np.where(self._done, -1, self._waits)  # envs that begin get none
+        for tick in range(self._ticks):
+            age = np.where(waits == tick, tick * self._period, np.inf)
+            observed = self.runner.step(chunk, latency=age)
+        return observed
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a picture (height, width, 3) of each env, in RGB; None without a ``render_mode``.
 
         It shows robot and floor, not the content of ``build``.
-
-        Raises
-        ------
-        CallOrderError
-            A step was begun and has not been waited for.
         """
         if self.render_mode is None:
             return None
-        self._expect_no_step("render")
         from batchpid.sim.view.film import Painter
 
         painter = Painter(self.robot, 1, self.runner.options.ground, (640, 480))
@@ -465,31 +368,26 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
     # -- episodes
     # ----------------------------------------------------------------------------------------------
 
-    def _begin(self, mask: Bool, seeds: Sequence[int] | None = None) -> None:
+    def _begin(self, mask: Bool, seeds: NDArray[np.int64] | None = None) -> None:
         """Draw episodes for the masked envs, of new ``seeds`` if there are any, and place their
         robots.
         """
-        dof = (self.robot.dof,)
         for env in np.flatnonzero(mask).tolist():
             if seeds is not None:
                 self._generators[env] = np.random.default_rng(seeds[env])
-            drawn = self.draw(env, self._generators[env])
+            self._starts[env] = self.draw(env, self._generators[env])
             if self._latency[1] > 0:
                 low, high = self._latency
                 late = self._generators[env].uniform(low, high)
                 self._waits[env] = min(np.ceil(late / self._period - 1e-9), self._ticks - 1)
-            self._starts[env] = self._returned("draw", drawn, dof)
         self._steps[mask] = 0
         self._done = self._done & ~mask
-        randomization = self.runner.options.randomization
-        if randomization is None:
+        if self.runner.options.randomization is None:
             seeds = None
         observed = self.runner.reset(self._starts, mask=mask, seed=seeds)
-        # The setpoint belongs to the pose that a randomization drew.
-        if randomization is not None and randomization.qpos is not None:
-            self._starts = np.where(mask[:, None], observed.qpos, self._starts)
-        first = self.first_setpoint(self._starts)
-        first = self._returned("first_setpoint", first, self.setpoint.shape, mask=mask)
+        first = self.runner.command.neutral
+        if self.runner.options.sets_positions:
+            first = observed.qpos
         self.setpoint = np.where(mask[:, None], first, self.setpoint)
         self._observe(observed)
 
@@ -532,12 +430,6 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
             problem = f"returned a number that is not finite, at index {index}"
             raise InvalidArgumentError(name, problem, remedy="return finite numbers")
         return rows.astype(dtype, copy=False)
-
-    def _expect_no_step(self, call: str) -> None:
-        """Raise CallOrderError if a step has begun and has not been waited for."""
-        # An error in a worker ends the step and closes the runner, which says so.
-        if self._is_stepping and not self.runner.closed:
-            raise CallOrderError(f"{call}: a step is under way; call step_wait() first")
 
     def _info(self, mask: Bool) -> Document:
         """Return the info of the masked envs in Gymnasium's vector style: each key and, as _key,

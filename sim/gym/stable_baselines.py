@@ -26,7 +26,7 @@ class SB3VecEnv(VecEnv):  # type: ignore[misc]
     Parameters
     ----------
     envs
-        Task, as from ``gymnasium.make_vec``, with ``autoreset_mode="SameStep"``.
+        Task, as from ``gymnasium.make_vec``, with ``autoreset_mode="Disabled"``.
 
     Raises
     ------
@@ -36,9 +36,9 @@ class SB3VecEnv(VecEnv):  # type: ignore[misc]
 
     def __init__(self, envs: VectorEnv[Any, Any, Any]) -> None:
         self.envs: Any = envs.unwrapped
-        if envs.metadata["autoreset_mode"] != AutoresetMode.SAME_STEP:
-            remedy = 'make them with autoreset_mode="SameStep"'
-            raise InvalidArgumentError("envs", "do not reset within a step", remedy=remedy)
+        if envs.metadata["autoreset_mode"] != AutoresetMode.DISABLED:
+            remedy = 'make them with autoreset_mode="Disabled"'
+            raise InvalidArgumentError("envs", "reset themselves", remedy=remedy)
         self.render_mode = self.envs.render_mode
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
@@ -51,20 +51,22 @@ class SB3VecEnv(VecEnv):  # type: ignore[misc]
         return np.asarray(observation)
 
     def step_async(self, actions: Rows) -> None:
-        """Send the actions."""
-        self.envs.step_async(actions)
+        """Keep the actions for :meth:`step_wait`."""
+        self._actions = actions
 
     def step_wait(self) -> tuple[Rows, Rows, Rows, list[Document]]:
         """Return observations, rewards, ends of episodes, and the infos of the envs."""
-        observation, reward, terminated, truncated, info = self.envs.step_wait()
+        observation, reward, terminated, truncated, info = self.envs.step(self._actions)
         ends = terminated | truncated
         infos = []
         for env, end in enumerate(ends):
-            entries = _of_env(info["final_info"] if end else info, env)
+            entries = _of_env(info, env)
             entries["TimeLimit.truncated"] = bool(truncated[env] and not terminated[env])
             if end:
-                entries["terminal_observation"] = info["final_obs"][env]
+                entries["terminal_observation"] = observation[env]
             infos.append(entries)
+        if ends.any():
+            observation, _ = self.envs.reset(options={"reset_mask": ends})
         return observation, reward.astype(np.float32), ends, infos
 
     def close(self) -> None:
@@ -94,7 +96,5 @@ class SB3VecEnv(VecEnv):  # type: ignore[misc]
 
 def _of_env(info: Document, env: int) -> Document:
     """Return the entries of an info for one env."""
-    entries = {
-        key: rows[env].item() for key, rows in info.items() if not key.startswith(("_", "final_"))
-    }
+    entries = {key: rows[env].item() for key, rows in info.items() if not key.startswith("_")}
     return entries | {"is_success": entries["success"]}

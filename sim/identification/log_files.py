@@ -18,7 +18,7 @@ from batchpid.sim.identification.log import CommandKind, Log, checked
 from batchpid.sim.recording.recording_files import RecordingError, read_recording
 from batchpid.sim.recording.setpoint_files import columns_by_joint, error, read_csv
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.rollout import ACTUATORS, PARAMS, RESET, RESTORE, Rollout
+from batchpid.sim.rollout import PARAMS, RESET, RESTORE, Rollout
 
 LOG_QUANTITIES = ("setpoint", "effort", "feedforward", "measured_effort", "qpos")
 HDF5 = (".h5", ".hdf5")
@@ -143,7 +143,6 @@ def logs_of_rollout(
         "has setpoints that a guard changed": np.any(rollout.guarded),
         "was made with a randomization": info.randomization,
         "has params that were changed": (within & PARAMS).any() and follows,
-        "has actuators that were changed": (within & ACTUATORS).any(),
         "has a snapshot that was restored": (within & RESTORE).any(),
         "has ticks of varied length": (lengths > 1e-9 + 1e-6 * rollout.tick).any(),
         "has failed": not rollout.ok.all(),

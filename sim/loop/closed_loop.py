@@ -13,7 +13,7 @@ import numpy as np
 
 import batchpid as bp
 from batchpid.arrays.array_types import Array, Pytree
-from batchpid.arrays.elementwise import exported, namespace, replace_envs
+from batchpid.arrays.elementwise import namespace, replace_envs
 from batchpid.checks import check_keywords
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.scene_spec import added_friction, own_friction
@@ -44,7 +44,6 @@ class Plant(Protocol):
         """
 
 
-@exported
 class LoopState(NamedTuple):
     """State of a closed loop, a tree of arrays (envs, ...)."""
 
@@ -54,7 +53,6 @@ class LoopState(NamedTuple):
     """Number of the episode of each env (envs,), on which the noise of sensors depends."""
 
 
-@exported
 class LoopObservation(NamedTuple):
     """Robots after a tick, arrays (envs, dof) as in :class:`batchpid.sim.Observation`."""
 
@@ -66,7 +64,7 @@ class LoopObservation(NamedTuple):
     """None without guard."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ClosedLoop:
     """A plant under the control of a Runner: :func:`closed_loop`.
 
@@ -77,11 +75,6 @@ class ClosedLoop:
     control: Control
     tree: RigidTree
     start: Array
-
-    def __repr__(self) -> str:
-        control = self.control
-        sizes = f"{control.envs} envs, {len(self.start)} joints"
-        return f"ClosedLoop({type(self.plant).__name__}, {sizes}, timestep={control.timestep:g})"
 
     def changed(
         self,

@@ -1,7 +1,7 @@
 """Group of envs that advance together: one pack, its control, and what both show and remember.
 
 An executor runs the sim steps. The group handles what happens between them: a possible failure, a
-command that is not finite, a push, the sensors of links, a reset, new params or actuators.
+command that is not finite, a push, the sensors of links, a reset, new params.
 """
 
 from __future__ import annotations
@@ -117,14 +117,10 @@ class EnvGroup:
         ``goes_on``, the states of the stages carry over; otherwise the stages start.
         """
         setup = GroupControl.of(self._options, self.pack, *self._acting(), self._controller)
-        stages, control = setup.stages, setup.control
+        stages = setup.stages
         if goes_on:
             executor = self._executor
-            before = executor.setup
-            # New motors begin the streams of their noise again.
-            if control.has_motors and not before.control.has_motors:
-                self._episode[:] = 0
-            pairs = zip(before.stages, executor.read_state(), strict=True)
+            pairs = zip(executor.setup.stages, executor.read_state(), strict=True)
             by_names = {stage.name: (stage, state) for stage, state in pairs}
             states = adopted(stages, by_names, setup.values(self._episode))
         else:
@@ -139,13 +135,6 @@ class EnvGroup:
         """Change gains, limits and times in flight; the controller's state carries on."""
         self._params = params
         self._make_control()
-
-    def set_actuators(self, actuators: bp.Actuators | None) -> None:
-        """Change the actuators in flight; their state carries on."""
-        before, self._actuators = self._actuators, actuators
-        if actuators is not None or before is not None:
-            self._write_joints()
-            self._make_control()
 
     def add_chunk(self, chunk: Float64, latency: Float64) -> None:
         """Add a chunk (M, rows, dof) that is ``latency`` (M,) [s] old to the plan."""
@@ -171,19 +160,14 @@ class EnvGroup:
 
         Floating bases are placed at ``base`` (M, 13): pose and twist. ``draws`` apply to all envs
         from now on; they differ from the previous draws in these envs alone.
-
-        An env whose ``qpos`` or ``qvel`` is not finite returns to its last start, and has failed.
         """
         self._draws = draws
         if mask.any():
             faults = self._faults
             faults.clear(mask)
             self._vary(mask, draws)
-            wrong = faults.take_starts(mask, qpos, qvel, base)
+            faults.take_starts(mask, qpos, qvel, base)
             self._place(mask, faults.start_qpos, faults.start_qvel)
-            for cause, entries in wrong.items():
-                faults.fail(entries, cause, self.steps, faults.start_qpos)
-            self._place_failed()
         self.observe(self._at(0))
 
     def _vary(self, mask: NDArray[np.bool_], draws: Draws) -> None:
@@ -321,14 +305,12 @@ class EnvGroup:
 
     def _parts(self) -> Document:
         """Return the arrays outside engine and control that a snapshot holds: results of the last
-        tick, episodes of the motors' noise, the state of faults and pushes, and the digests of the
-        user's content.
+        tick, episodes of the motors' noise, and the state of faults and pushes.
         """
         return self._shown | {
             "episode": self._episode,
             "containment": self._faults.state,
             "pushes": self._pushes.counts,
-            "content": {"digest": self.pack.content} if self.pack.content.size else {},
         }
 
     def snapshot(self) -> dict[str, Rows]:

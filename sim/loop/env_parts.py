@@ -5,7 +5,7 @@ every sim step with the state of the group.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Array, Bool, Document, Float64, Rows
+from batchpid.arrays.array_types import Array, Bool, Document, Float64
 from batchpid.arrays.elementwise import namespace, precision, read_only
 from batchpid.arrays.trees import flatten, unflatten
 from batchpid.errors import ControllerError, InvalidArgumentError
@@ -140,33 +140,21 @@ class OwnController:
         if type(options.control) is OperationalSpace:
             self._reporting = options.control.advance
         self._structure: Any = None
+        self._first: Document = {}
 
-    def init(self, envs: int) -> dict[str, Rows]:
+    def init(self, envs: int) -> Document:
         """Return a checked copy of the controller's initial state for ``envs`` envs.
 
-        Raises InvalidArgumentError if an array of the state does not have the envs as its first
-        axis; at a later start ControllerError if the controller fails, or its state has other
-        arrays than the first.
+        Raises ControllerError if the controller fails, an array of the state does not have the envs
+        as its first axis, or the state has other arrays than at the first start.
         """
-        if self._structure is None:
-            self._first = self._begun(envs)
-            return self._first
         with controller_errors(self):
-            return _like(self._first, self._begun(envs), envs)
-
-    def _begun(self, envs: int) -> dict[str, Rows]:
-        # The structure stays the same; between sim steps only its arrays are kept, by name.
-        state = self._structure = _begin(self._options, envs)
-        leaves = {name: np.array(leaf) for name, leaf in flatten(state).items()}
-        for name, leaf in leaves.items():
-            if leaf.shape[:1] != (envs,):
-                raise InvalidArgumentError(
-                    "control",
-                    f"init returned a state{name and ' ' + name} of shape {leaf.shape}, for {envs}"
-                    " envs",
-                    remedy="make the envs the first axis of every array of the state",
-                )
-        return leaves
+            state = _begin(self._options, envs)
+            arrays = {name: np.array(leaf) for name, leaf in flatten(state).items()}
+            if self._structure is None:
+                # The structure stays the same; between sim steps only its arrays are kept, by name.
+                self._structure, self._first = state, arrays
+            return _like(self._first, arrays, envs)
 
     def __call__(self, state: Document, *inputs: Array) -> tuple[Array, ...]:
         """Return the new state and the effort (M, dof); inputs are setpoint, qpos, qvel, passive
@@ -176,30 +164,18 @@ class OwnController:
         efforts (M, dof).
 
         Raises InvalidArgumentError if the controller returned an effort or a state of a wrong shape
-        or dtype, or JAX cannot trace it.
+        or dtype.
         """
-        xp = namespace(*inputs[1:3])
+        qpos = inputs[1]
+        xp = namespace(qpos)
         if xp is np:
             # The controller may keep them, but not write to them.
-            return self._checked(state, [read_only(np.array(rows)) for rows in inputs], xp)
-        import jax
-
-        try:
-            return self._checked(state, inputs, xp)
-        except (TypeError, jax.errors.JAXTypeError, jax.errors.JAXIndexError) as error:
-            raise InvalidArgumentError(
-                "control",
-                f"cannot be traced by JAX: {str(error).splitlines()[0]}",
-                remedy="write it in jax.numpy, or use backend='numpy'",
-            ) from error
-
-    def _checked(self, state: Document, inputs: Sequence[Array], xp: Any) -> tuple[Array, ...]:
+            inputs = tuple([read_only(np.array(rows)) for rows in inputs])
         new, returned, *limited = self._called(unflatten(self._structure, state), *inputs)
-        qpos = inputs[1]
         # Copies: the controller may change its own arrays at any time.
-        leaves = _like(state, flatten(new, read=xp.array), len(qpos))
+        arrays = _like(state, flatten(new, read=xp.array), len(qpos))
         effort = _like({"effort": qpos}, {"effort": xp.array(returned, qpos.dtype)}, len(qpos))
-        return leaves, effort["effort"], *limited
+        return arrays, effort["effort"], *limited
 
     def _called(self, *arguments: Any) -> tuple[Array, ...]:
         if self._reporting is not None:

@@ -20,13 +20,10 @@ from batchpid.sim.loop.arrays import Arrays, FaultArrays
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.stages.values import Command
 
-CAUSES = ("state", "effort", "qpos", "qvel", *Command._fields)
+CAUSES = ("state", "effort", *Command._fields)
 """Causes of faults: the state is not finite or a position beyond :data:`FARTHEST`, or the array of
 that name was not finite. "effort" is the effort that the caller's own controller returned.
 """
-COMMAND_CAUSES = ("setpoint", "setpoint_rate", "setpoint_acceleration")
-"""Causes in an entry of the command, which need not be a joint."""
-
 MOST_EVENTS = 10_000
 """Largest number of faults that a runner keeps."""
 NO_STEP = -1
@@ -42,15 +39,11 @@ class Fault(NamedTuple):
     time: float
     """Time of that step [s]."""
     joint: str
-    """First joint that failed; with ``kind`` "entry" the first entry of the command that is not
-    finite.
-    """
+    """First joint that failed, or first entry of a command that is not finite."""
     cause: str
     """One of :data:`CAUSES`."""
     action: str
     """``on_fault`` of the runner: "hold" or "reset"."""
-    kind: str = "joint"
-    """"joint", or "entry" for the setpoint of a command whose entries are not joints."""
 
     def __str__(self) -> str:
         texts = {
@@ -63,7 +56,7 @@ class Fault(NamedTuple):
         else:
             action = "reset"
         return (
-            f"env {self.env}, {self.kind} {self.joint!r}: {cause}, at step {self.step}"
+            f"env {self.env}, {self.joint!r}: {cause}, at step {self.step}"
             f" ({self.time:g} s); {action}"
         )
 
@@ -116,19 +109,11 @@ class FaultContainment:
         qpos: Float64,
         qvel: Float64,
         base: Float64 | None,
-    ) -> dict[str, Bool]:
-        """Take the states (M, ...) to which the envs of ``mask`` (M,) are reset; return the entries
-        that are not finite, by cause. An env with such an entry keeps its last start.
-        """
-        causes = {"qpos": qpos, "qvel": qvel}
-        wrong: dict[str, Bool] = {
-            cause: mask[:, None] & ~np.isfinite(rows) for cause, rows in causes.items()
-        }
-        good = mask & ~(wrong["qpos"] | wrong["qvel"]).any(1)
-        self.start_qpos[good], self.start_qvel[good] = qpos[good], qvel[good]
+    ) -> None:
+        """Take the states (M, ...) to which the envs of ``mask`` (M,) are reset."""
+        self.start_qpos[mask], self.start_qvel[mask] = qpos[mask], qvel[mask]
         if base is not None:
-            self.start_base[good] = base[good]
-        return wrong
+            self.start_base[mask] = base[mask]
 
     def contained(self, command: Command, step: int, qpos: Float64) -> Command:
         """Record a fault in sim step ``step`` of the envs whose commands are not finite; return the

@@ -19,7 +19,6 @@ from batchpid.arrays.trees import leaves, mapped
 from batchpid.motors.friction import Friction
 from batchpid.native.extensions import MOST_SUMMED
 from batchpid.sim.description.merging import coupling_of
-from batchpid.sim.engine import native
 from batchpid.sim.engine.native_model import NativeRefresh
 from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.env_parts import OwnController
@@ -206,23 +205,20 @@ def native_obstacle(options: RunnerOptions) -> str:
 
 
 def describe(options: RunnerOptions) -> str:
-    """Describe the library of the law, and the calls into the engine, with reasons."""
+    """Describe the library of the law, and the calls into the engine, with the reason if one of them
+    is not native.
+    """
     engine = options.load_engine()
     lack = engine.native_obstacle()
-    reason = "" if lack else native_obstacle(options)
+    reason = lack or native_obstacle(options)
+    law = "in NumPy" if reason else "as a native program"
     if options.backend == "jax":
         law = "in JAX"
-    elif lack or reason:
-        law = "in NumPy"
-    else:
-        law = "as a native program"
     if options.control == "drive":
         law = f"in {engine.title} (control 'drive')"
-    if reason:
-        steps = f", one call per sim step ({reason})"
-    else:
-        steps = ""
-    return f"law {law}{steps}, {native.describe_calls(engine.title, lack)}"
+    calls = "Python" if lack else "native"
+    text = f"law {law}, {calls} calls into {engine.title}"
+    return f"{text} ({reason})" if reason else text
 
 
 # -- functions of the model

@@ -42,29 +42,17 @@ class Failure(NamedTuple):
     """Ticks of the request that were completed before the error."""
     error: Exception
 
-    def portable(self) -> Failure:
+    def portable(self, worker: str) -> Failure:
         """Return the failure with an error class of this project, which another process can raise,
-        and the traceback.
-
-        :meth:`of_worker` puts the name of the worker in front of the message of a WorkerError.
+        and the traceback. ``worker`` names its process.
         """
         error = self.error
         text = "".join(traceback.format_exception(error))
         if isinstance(error, ControllerError):
-            # A node of a cluster passes on the failure of its worker, which has its note.
-            if not hasattr(error, "__notes__"):
-                error.add_note(text)
+            error.add_note(text)
         elif not isinstance(error, BatchPIDError):
-            error = WorkerError(f"raised:\n{text}")
+            error = WorkerError(f"{worker} raised:\n{text}")
         return self._replace(error=error)
-
-    def of_worker(self, name: str) -> Failure:
-        """Return the failure with the name of its worker in front of the message of a
-        WorkerError.
-        """
-        if type(self.error) is WorkerError:
-            return self._replace(error=WorkerError(f"{name} {self.error}"))
-        return self
 
 
 def failed(error: Exception) -> Failure:

@@ -73,7 +73,7 @@ class TickProgram:
             timestep=control.timestep,
             dof=pack.dof,
             late=control.late,
-            matrix_steps=getattr(setup.stage("matrix"), "steps", 1),
+            matrix_steps=getattr(setup.stage("matrix"), "every", 1),
             gravity=control.gravity,
             coriolis=control.coriolis,
         )

@@ -14,8 +14,8 @@ documentation). Newton steps on the set of active limits find the minimum.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any, Self
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -50,15 +50,6 @@ class TreePlant:
     limit_time: float
     """Time constant of the limits [s]: MuJoCo's ``solref``."""
     timestep: float
-
-    def with_masses(self, factor: Array) -> Self:
-        """Return the plant with masses and inertias multiplied by ``factor`` (dof,), one for the
-        link that each joint moves; it may be traced.
-        """
-        bodies = self.bodies
-        rows = namespace(factor).append(factor, 1.0)[:, None]  # the base keeps its mass
-        heavy = bodies._replace(mass=bodies.mass * rows, tensor=bodies.tensor * rows[..., None])
-        return replace(self, bodies=heavy)
 
     def init(self, qpos: Array, qvel: Array) -> tuple[Array, Array]:
         """Return the state of robots at ``qpos`` and ``qvel`` (envs, dof)."""

@@ -171,7 +171,7 @@ class SceneOptions(OptionGroup):
     ``obs.wrench``; default none. It needs ``engine="mujoco"``.
     """
     build: Annotated[Callable[[Any, int], Any] | None, option("snapshot", "scene")] = None
-    """Function ``build(scene, env)`` that adds user content to the ``sapien.Scene`` of each env;
+    """Function ``build(scene, env)`` that adds actors to the ``sapien.Scene`` of each env;
     it needs ``engine="sapien"``.
     Visuals and lights are ignored, so code that was written for a screen runs unchanged. It may
     return the entities that :meth:`batchpid.sim.Runner.poses` reports. A reset returns the content
@@ -266,7 +266,7 @@ class SceneOptions(OptionGroup):
         if falling:
             problem = f"are False, and nothing holds {', '.join(falling)}"
             raise InvalidArgumentError("collisions", problem, remedy="leave it out")
-        for argument in ("ground", "contacts"):
+        for argument in ("ground", "contacts", "build"):
             if getattr(self, argument):
                 problem = "need collisions, which are off"
                 raise InvalidArgumentError(argument, problem, remedy="leave out collisions=False")
@@ -425,8 +425,8 @@ class ControlOptions(OptionGroup):
     or when a position is beyond 1e6 rad or m. The other envs are not affected.
     """
     on_invalid_input: Annotated[InvalidInputAction, option("next commands")] = "raise"
-    """Response to NaN or infinity in a command or in a pose to reset to: ``"raise"`` (default)
-    raises an error, and ``"contain"`` lets only the env concerned fail.
+    """Response to NaN or infinity in a command: ``"raise"`` (default) raises an error, and
+    ``"contain"`` lets only the env concerned fail.
     """
 
     def fit(self, robot: Robot) -> Self:

@@ -152,7 +152,8 @@ class RunnerOptions(RunnerKeywords):
     def scene(self) -> SceneSpec:
         """Description of the scenes, for the engine."""
         options = self.values_for("scene")
-        return scene_of(self.robot, mjcf=self.mjcf, **options)
+        drives = self.control == "drive"
+        return scene_of(self.robot, mjcf=self.mjcf, drives=drives, **options)
 
     def _check_tree(self, argument: str, value: object, remedy: str) -> None:
         """Raise InvalidArgumentError for an option that needs a kinematic tree, if the robot has

@@ -46,6 +46,21 @@ LEADER_FIELDS = ("bias", *JOINT_SIDE)
 """Fields of the actuators that followers do not have."""
 
 
+def env_streams(seed: ArrayLike, num_envs: int, first_env: int = 0) -> Episodes:
+    """Return the stream of each env (envs,): ``seed`` plus its number, or its entry of ``seed``.
+
+    Raises InvalidArgumentError if one is negative or not a whole number, or their number is wrong.
+    """
+    streams = read_array("seed", seed, "iu").astype(np.int64)
+    if streams.ndim == 0:
+        streams = streams + first_env + np.arange(num_envs)
+    # A sum beyond the largest int is negative, too.
+    if streams.shape != (num_envs,) or streams.min() < 0:
+        problem = f"must be a whole number >= 0, or {num_envs} of them, one for each env"
+        raise InvalidArgumentError("seed", problem, value=seed, remedy="pass an int")
+    return streams
+
+
 @dataclass(frozen=True, kw_only=True)
 class Randomization:
     """Distributions of the parameters of the robots, for the option ``randomization`` of
@@ -205,13 +220,7 @@ class Randomization:
         """
         episodes = draws.episodes + np.array([0, 1])
         if seed is not None:
-            streams = read_array("seed", seed, "iu").astype(np.int64)
-            if streams.ndim == 0:
-                streams = streams + first_env + np.arange(len(mask))
-            # A sum beyond the largest int is negative, too.
-            if streams.shape != mask.shape or streams.min() < 0:
-                problem = f"must be a whole number >= 0, or {len(mask)} of them, one for each env"
-                raise InvalidArgumentError("seed", problem, value=seed, remedy="pass an int")
+            streams = env_streams(seed, len(mask), first_env)
             episodes = np.stack([streams, np.zeros_like(streams)], 1)
         if mask.all():
             return self.draw(robot, episodes)

@@ -2,12 +2,7 @@
 ticks first.
 
 Each field of its :class:`batchpid.sim.RunInfo` is an attribute of the file: a number, a text, an
-array of them, or JSON (:data:`READERS`). Two more are ``num_envs`` and ``tick`` [s]. The datasets
-``feedforward`` and ``changes`` are empty where there are none.
-
-A row is valid if its ``time`` is a number: times are written last, and only after the other arrays
-are on the disk. So any reader of HDF5 can read the file after a kill, up to the last row that has a
-time.
+array of them, or JSON (:data:`READERS`). Another one is ``tick`` [s].
 """
 
 from __future__ import annotations
@@ -15,11 +10,11 @@ from __future__ import annotations
 import io
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -32,21 +27,12 @@ from batchpid.sim.loop.faults import Fault
 from batchpid.sim.rollout import OPTIONAL, Rollout, RunInfo
 from batchpid.sim.signals import CommandSpec, Observation
 
-if TYPE_CHECKING:
-    import h5py  # functions load it, since commands that record nothing start sooner without it
-
-FORMAT = "batchpid-recording-3"
+FORMAT = "batchpid-recording-4"
 HDF5 = (".h5", ".hdf5")
-LIBVER = ("v108", "v108")
-"""Versions of HDF5's format. Later ones mark a file that was not closed, and HDF5 then refuses to
-open it.
-"""
-CHUNK_BYTES = 1 << 18
-"""Approximate size of a chunk of a dataset."""
 
 
 class RecordingError(BatchPIDError, OSError):
-    """A recording cannot be written or read; the message names the file and the cause."""
+    """A recording cannot be read; the message names the file and the cause."""
 
 
 def write_recording(
@@ -69,30 +55,35 @@ def write_recording(
     ------
     InvalidArgumentError
         The file exists already, or its name ends otherwise.
-    RecordingError
+    OSError
         The file cannot be written.
     """
     instance("rollout", rollout, Rollout, "pass what runner.rollout() returned")
-    path = check_path(path, overwrite=overwrite)
+    path = file_path("path", path, HDF5)
+    if os.path.lexists(path) and not overwrite:
+        remedy = "choose another name, or pass overwrite=True"
+        raise InvalidArgumentError("path", "exists already", value=str(path), remedy=remedy)
+    # Commands that record nothing start sooner without it.
     import h5py
 
-    content = io.BytesIO()  # on a full disk HDF5 could not close its own file
-    with h5py.File(content, "w", libver=LIBVER) as file:
-        datasets = create_datasets(file, rollout.info, rollout.num_envs, rollout.tick)
-        write_rows(datasets, 0, rollout.arrays())
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, content.getvalue(), overwrite)
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be written: {error.strerror or error}") from error
+    info = replace(rollout.info, urdf=_urdf_of(rollout.info))
+    # On a full disk HDF5 could not close its own file. Older versions of its format hold no long
+    # attributes.
+    content = io.BytesIO()
+    with h5py.File(content, "w", libver="v108") as file:
+        file.attrs.update(attributes(info) | {"format": FORMAT, "tick": rollout.tick})
+        for name, array in rollout.arrays().items():
+            file[name] = array
+            file[name].attrs["unit"] = ["s"] if name == "time" else list(info.units_of(name))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, content.getvalue(), overwrite)
     return path
 
 
 def read_recording(path: str | os.PathLike[str]) -> Rollout:
-    """Read a recording: complete, cut short by a kill, or one that is still being written.
+    """Read a recording.
 
-    ``info.complete`` of the result says whether the run came to its end. Nothing in the file is
-    executed; SECURITY.md lists the risks of files of unknown origin.
+    Nothing in the file is executed; SECURITY.md lists the risks of files of unknown origin.
 
     Parameters
     ----------
@@ -114,22 +105,20 @@ def read_recording(path: str | os.PathLike[str]) -> Rollout:
             if file.attrs.get("format") != FORMAT:
                 raise ValueError(f"its format is not {FORMAT}")
             info = read_info(file.attrs)
-            num_envs = int(file.attrs["num_envs"])
-            _check_info(info, num_envs)
             tick = float(file.attrs["tick"])
-            time = file["time"][:]
-            # The rows of a run that still goes on, or was killed, end at the first without a time.
-            count = int(np.append(np.isfinite(time), False).argmin())
-            arrays = {"time": time[:count]}
+            arrays = {"time": file["time"][:]}
+            count = len(arrays["time"])
+            num_envs = file["qpos"].shape[1]
+            _check_info(info, num_envs)
             for name, quantity in info.recorded.items():
-                array = file[name][:count]
+                if name in OPTIONAL and name not in file:
+                    arrays[name] = None
+                    continue
+                array = file[name][:]
                 shape = (count, *info.row_shape(name, num_envs))
                 if array.shape != shape:
                     raise ValueError(f"its {name} has shape {array.shape}, not {shape}")
                 arrays[name] = array.astype(quantity.dtype, casting="same_kind", copy=False)
-            for name in OPTIONAL:
-                if not file[name].id.get_storage_size():
-                    arrays[name] = None
     except Exception as error:  # a damaged file can make HDF5 raise anything
         raise RecordingError(
             f"{path}: cannot be read as a recording: {error or type(error).__name__}"
@@ -154,53 +143,6 @@ def _check_info(info: RunInfo, num_envs: int) -> None:
             raise ValueError(f"its {name} has shape {np.shape(value)}, not {shape}")
 
 
-def check_path(path: str | os.PathLike[str], *, overwrite: bool) -> Path:
-    """Return ``path`` if a recording can be written there.
-
-    Raises
-    ------
-    InvalidArgumentError
-        Its suffix is not in :data:`HDF5`, or the file exists and ``overwrite`` is False.
-    """
-    path = file_path("path", path, HDF5)
-    if os.path.lexists(path) and not overwrite:
-        remedy = "choose another name, or pass overwrite=True"
-        raise InvalidArgumentError("path", "exists already", value=str(path), remedy=remedy)
-    return path
-
-
-def create_datasets(
-    file: h5py.File,
-    info: RunInfo,
-    num_envs: int,
-    tick: float,
-) -> dict[str, h5py.Dataset]:
-    """Write ``info`` to a new file; return empty datasets that can grow: time and
-    :attr:`RunInfo.recorded`.
-    """
-    info = replace(info, urdf=_urdf_of(info))
-    file.attrs.update(attributes(info) | {"format": FORMAT, "num_envs": num_envs, "tick": tick})
-    time = file.create_dataset(
-        "time",
-        (0,),
-        "f8",
-        maxshape=(None,),
-        chunks=(4096,),
-        fillvalue=np.nan,
-    )
-    time.attrs["unit"] = ["s"]
-    datasets = {"time": time}
-    for name, quantity in info.recorded.items():
-        row = info.row_shape(name, num_envs)
-        dtype = np.dtype(quantity.dtype)
-        rows = max(1, CHUNK_BYTES // max(1, int(np.prod(row)) * dtype.itemsize))
-        datasets[name] = dataset = file.create_dataset(
-            name, (0, *row), dtype, maxshape=(None, *row), chunks=(rows, *row)
-        )
-        dataset.attrs["unit"] = list(info.units_of(name))
-    return datasets
-
-
 def _urdf_of(info: RunInfo) -> str | None:
     """Return the robot of a run as a URDF; None for one that a URDF cannot hold."""
     if info.description is None:
@@ -210,24 +152,6 @@ def _urdf_of(info: RunInfo) -> str | None:
     with suppress(RobotError):
         return to_urdf(info.description).text
     return None
-
-
-def write_rows(datasets: Mapping[str, h5py.Dataset], first: int, arrays: Document) -> None:
-    """Write ``arrays``, ticks first, from row ``first`` on; it can be repeated if it was
-    interrupted.
-    """
-    time = datasets["time"]
-    end = first + len(arrays["time"])
-    for name, dataset in datasets.items():
-        if name != "time":
-            dataset.resize(end, axis=0)
-            if arrays.get(name) is not None:
-                dataset[first:end] = arrays[name]
-    # A row is valid once it has a time, so times follow when the rest is on the disk.
-    time.file.flush()
-    time.resize(end, axis=0)
-    time[first:end] = arrays["time"]
-    time.file.flush()
 
 
 # -- attributes

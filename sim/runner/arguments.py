@@ -203,13 +203,8 @@ def _check_acceleration(params: bp.PIDParams, inputs: Mapping[str, ArrayLike | N
 def joint_rows(options: RunnerOptions, name: str, value: ArrayLike) -> Float64:
     """Return positions or velocities (envs, dof) to reset to."""
     robot = options.robot
-    is_finite = options.on_invalid_input == "raise"
-    rows = array(
-        name, value, (options.num_envs, robot.dof), robot.joint_names, finite=is_finite
-    ).copy()
-    if is_finite:
-        return within(name, rows, FARTHEST, robot.joint_names)
-    return np.where(np.abs(rows) > FARTHEST, np.nan, rows)
+    rows = array(name, value, (options.num_envs, robot.dof), robot.joint_names).copy()
+    return within(name, rows, FARTHEST, robot.joint_names)
 
 
 def base_rows(

@@ -18,10 +18,10 @@ from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.checks import env_mask
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.loop.arrays import Arrays, Snapshot
-from batchpid.sim.loop.faults import CAUSES, COMMAND_CAUSES, MOST_EVENTS, NO_STEP, Fault
+from batchpid.sim.loop.faults import CAUSES, MOST_EVENTS, NO_STEP, Fault
 from batchpid.sim.options.options import IDEAL, RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
-from batchpid.sim.rollout import ACTUATORS, PARAMS, RESET, RESTORE
+from batchpid.sim.rollout import PARAMS, RESET, RESTORE
 from batchpid.sim.runner.arguments import base_rows, joint_rows
 from batchpid.sim.workers.pool import Outcome
 from batchpid.sim.workers.requests import Request
@@ -152,8 +152,6 @@ def committed(options: RunnerOptions, state: RunnerState, outcome: Outcome) -> R
         return _after_restore(state, *arguments)
     if method == "set_params":
         return state.changed(PARAMS, params=arguments[0])
-    if method == "set_actuators":
-        return state.changed(ACTUATORS, actuators=arguments[0])
     if method == "snapshot":
         return state._replace(steps_since_checkpoint=0)
     return state
@@ -261,10 +259,9 @@ def _fault(options: RunnerOptions, env: int, arrays: Arrays) -> Fault:
     """Return the last fault of an env in the arrays of a tick."""
     step = int(arrays.fault.step[env])
     cause = CAUSES[arrays.fault.cause[env]]
-    command = options.own_command
-    kind, names = "joint", options.robot.joint_names
-    if command is not None and cause in COMMAND_CAUSES:
-        kind, names = "entry", command.names
+    names = options.robot.joint_names
+    if cause in Command._fields:
+        _, names = options.command_columns[Command._fields.index(cause)]
     joint = names[arrays.fault.joint[env]]
     return Fault(
         env,
@@ -273,5 +270,4 @@ def _fault(options: RunnerOptions, env: int, arrays: Arrays) -> Fault:
         joint,
         cause,
         options.on_fault,
-        kind,
     )

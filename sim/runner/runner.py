@@ -14,7 +14,7 @@ from dataclasses import replace
 from functools import cached_property
 from operator import itemgetter, methodcaller
 from time import strftime
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -57,13 +57,9 @@ from batchpid.sim.runner.operations import (
 )
 from batchpid.sim.signals import CommandSpec, Observation, empty_observation
 from batchpid.sim.tool_space import OperationalSpace
-from batchpid.sim.workers.node import NodeInfo
 from batchpid.sim.workers.pool import Outcome, RecoveryWarning, WorkerPool
 from batchpid.sim.workers.requests import OneCall, Request
 from batchpid.stages.values import Command
-
-if TYPE_CHECKING:
-    from batchpid.sim.recording.recorder import Recorder
 
 CHECKPOINT_STEPS = 8000
 """Least number of sim steps between checkpoints, from the last of which a lost worker is replayed."""
@@ -121,8 +117,6 @@ class Runner(SingleOwner):
         self.control = checked.control
         self.timestep = checked.timestep
         self.substeps = checked.substeps
-        self.recorder: Recorder | None = None
-        """Recorder of every tick; :class:`batchpid.sim.Recorder` sets it."""
         self._call = OneCall()
         self._state = RunnerState.first(checked)
         self._cause: BaseException | None = None  # of the end
@@ -409,19 +403,8 @@ class Runner(SingleOwner):
 
     @property
     def actuators(self) -> bp.Actuators | None:
-        """Actuators, None for ideal ones; assign others to change them in flight. Delays keep their
-        histories.
-
-        As in the option, assign None for the robot's own actuators, and ``bp.Actuators()`` for
-        ideal ones.
-        """
+        """Actuators; None for ideal ones. A snapshot brings its own."""
         return self._state.actuators
-
-    @actuators.setter
-    def actuators(self, actuators: bp.Actuators | None) -> None:
-        self._ready()
-        checked = self.options.check_actuators(actuators)
-        self._execute(Request("set_actuators", (checked,)))
 
     def snapshot(self) -> Snapshot:
         """Return the state of all envs, physics and controller, for :meth:`restore`.
@@ -553,11 +536,6 @@ class Runner(SingleOwner):
         """Process ids of the workers."""
         return tuple(worker.pid for worker in self._pool.workers if worker.pid is not None)
 
-    @property
-    def nodes(self) -> tuple[NodeInfo, ...]:
-        """Machines of a cluster, in the order of their envs; empty without ``cluster``."""
-        return self._pool.nodes
-
     def close(self) -> None:
         """End the workers and free the scenes. May be called again, as after an interrupt."""
         self._pool.closed = True
@@ -614,10 +592,6 @@ class Runner(SingleOwner):
             count = self.substeps
         else:
             count = checked_option("substeps", substeps)
-        if self.recorder is not None and count != self.substeps:
-            problem = f"is not the runner's {self.substeps}"
-            remedy = "all ticks of a recording have the same length"
-            raise InvalidArgumentError("substeps", problem, value=count, remedy=remedy)
         inputs = dict(zip(Command._fields, arrays, strict=True))
         command, chunks = self._command(inputs, latency, count * self.timestep)
         for chunk in chunks:
@@ -674,15 +648,13 @@ class Runner(SingleOwner):
         # From here on Ctrl-C waits, so that workers and state change together or not at all.
         call.begin()
         try:
-            call.waits, before = True, self._state
+            call.waits = True
             pool.begin(request)
             outcome = pool.finish()
             call.waits = False
             # Ticks before a failure count: the workers have run them.
             if outcome.failure is None or is_run:
-                self._state = committed(self.options, before, outcome)
-            if is_run and self.recorder is not None:
-                self._record(self.recorder, before, outcome)
+                self._state = committed(self.options, self._state, outcome)
             if outcome.failure is not None and request.changes_loop:
                 self._fail(outcome.failure.error)
         except BaseException as error:
@@ -705,8 +677,7 @@ class Runner(SingleOwner):
         return outcome
 
     def _prepare(self, request: Request) -> None:
-        """Take a checkpoint if one is due, before ticks or a reset, and let the recorder keep the
-        state before its first tick.
+        """Take a checkpoint if one is due, before ticks or a reset.
 
         Before a reset it is one that the loops do not notice. It holds all that there is of an env
         after its next reset. With ``build`` that is not so: the user's content is not rebuilt.
@@ -715,8 +686,6 @@ class Runner(SingleOwner):
         if request.method == "run":
             if is_due and self._keeps_bits:
                 self._take_snapshot()
-            if self.recorder is not None:
-                self.recorder.prepare()
         elif is_due and request.method == "reset":
             keeps_rest = self._keeps_bits or self.options.build is not None
             if not (keeps_rest or self._pool.replay.waits):
@@ -728,18 +697,6 @@ class Runner(SingleOwner):
     def _keeps_bits(self) -> bool:
         """Whether envs go on with the same bits after a snapshot as without it."""
         return "complete_state" in self.options.load_engine().capabilities
-
-    def _record(self, recorder: Recorder, before: RunnerState, outcome: Outcome) -> None:
-        """Pass completed ticks on to the recorder."""
-        run = outcome.request
-        for number, arrays in enumerate(outcome.completed):
-            time = (before.steps + (number + 1) * run.substeps) * self.timestep
-            recorder.append(
-                time,
-                run.command.map(itemgetter(number)),
-                self._with_tool(arrays.observation.map(COPY)),
-                None if number else before.changes,
-            )
 
     def _fail(self, error: BaseException) -> None:
         """End the runner, which cannot complete a command."""

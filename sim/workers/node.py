@@ -11,8 +11,9 @@ from __future__ import annotations
 import logging
 import os
 import pickle
-from typing import Any, NamedTuple
+from typing import Any
 
+from batchpid.arrays.trees import leaves
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.loop import Failure, failed
@@ -25,70 +26,45 @@ half a second.
 """
 
 
-class NodeInfo(NamedTuple):
-    """Machine of a cluster, and the processes that run some of a runner's envs there."""
-
-    address: str
-    """Address of the machine."""
-    envs: slice
-    """Envs of the runner."""
-    pid: int
-    """Process that holds the pool of workers."""
-    pids: tuple[int, ...]
-    """Worker processes."""
-
-
 class Node:
     """Pool of the envs of one machine, as a Ray actor.
 
-    A method returns its result, or a failure of the pool, and the output (ticks, envs, ...) of the
-    ticks that were completed; None where the request does not change the observation.
+    ``message`` is pickled: the type of the pool, the :class:`Start` of its envs, and the most ticks
+    of a request.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, message: bytes, workers: int) -> None:
+        self._message, self._workers = message, workers
         self._pool: Any = None
 
-    def start(self, message: bytes, workers: int) -> tuple[object, Arrays | None]:
-        """Start the pool; return a :class:`NodeInfo`.
-
-        ``message`` is pickled: the type of the pool, the :class:`Start` of its envs, and the most
-        ticks of a request.
-        """
-        import ray
-
-        try:
-            pool_type, start, ticks = pickle.loads(message)
-            options = start.options.changed(workers=workers, cluster=None)
-            self._pool = pool_type(options, start.envs, ticks)
-            # The caller replaces a node that has lost a worker: it keeps the requests to replay.
-            self._pool.max_losses = 1
-            self._pool.open()
-        except Exception as error:
-            return _failure(error), None
-        pids = tuple(worker.pid for worker in self._pool.workers)
-        address = ray.util.get_node_ip_address()
-        return NodeInfo(address, start.envs, os.getpid(), pids), None
-
     def execute(self, request: Request) -> tuple[object, Arrays | None]:
-        """Execute a request, which has the part of this node's envs."""
+        """Execute a request, which has the part of this node's envs; the first one starts the pool.
+
+        Return its result, or a failure, and the output (ticks, envs, ...); None where the request
+        does not change the observation.
+        """
         try:
+            if self._pool is None:
+                pool_type, start, ticks = pickle.loads(self._message)
+                options = start.options.changed(workers=self._workers, cluster=None)
+                self._pool = pool_type(options, start.envs, ticks)
+                # The caller replaces a node that has lost a worker: it keeps the requests to replay.
+                self._pool.max_losses = 1
+                self._pool.open()
+                return None, None
             outcome = self._pool.run(request)
         except Exception as error:
-            return _failure(error), None
+            # The caller's own words follow the cause of a loss.
+            if isinstance(error, WorkerLost):
+                error = WorkerLost(str(error.__cause__))
+            return failed(error).portable("node"), None
         self._pool.replay.start_from(None)
         arrays = None
         if outcome.num_ticks:
             arrays = self._pool.arrays.at(slice(outcome.num_ticks))
         if outcome.failure is not None:
-            return outcome.failure.portable(), arrays
+            return outcome.failure, arrays
         return outcome.result, arrays
-
-
-def _failure(error: Exception) -> Failure:
-    """Return an error of the pool for the caller, whose own words follow the cause of a loss."""
-    if isinstance(error, WorkerLost):
-        error = WorkerLost(str(error.__cause__))
-    return failed(error).portable()
 
 
 class Cluster:
@@ -154,24 +130,19 @@ class NodeWorker(Worker):
         self._message = pickled((pool_type, start, ticks))
         self._actor: Any = None
         self._cpus = cluster.workers
-        self.info: NodeInfo | None = None
-        """Known when the node has started."""
 
     def open(self) -> None:
         actor_type = self._cluster.ray.remote(Node).options(
             num_cpus=self._cpus,
             scheduling_strategy="SPREAD",
         )
-        self._actor = actor_type.remote()
+        self._actor = actor_type.remote(self._message, self._cluster.workers)
         # A node that replaces a lost one reserves no CPUs, which the lost one has until it has ended.
-        self._cpus, self.info = 0, None
+        self._cpus = 0
 
     def send(self, request: Request) -> None:
         self._seconds = self._limit(request)
-        if request.method == "build":
-            self._call = self._actor.start.remote(self._message, self._cluster.workers)
-        else:
-            self._call = self._actor.execute.remote(request.for_envs(self.envs))
+        self._call = self._actor.execute.remote(request.for_envs(self.envs))
 
     def receive(self) -> object:
         exceptions = self._cluster.ray.exceptions
@@ -185,18 +156,11 @@ class NodeWorker(Worker):
             ticks = slice(len(arrays.observation.ok))
             part = self._shared.arrays.at((ticks, self.envs))
             # The caller has the command.
-            for ours, theirs in zip(part[1:], arrays[1:], strict=True):
-                tables: Any = zip(ours, theirs, strict=True)
-                for table, rows in tables:
-                    if table is not None:
-                        table[...] = rows
-        if isinstance(result, NodeInfo):
-            self.info = result
-        if not isinstance(result, Failure):
-            return result
-        if isinstance(result.error, WorkerLost):
+            for table, rows in zip(leaves(part[1:]), leaves(arrays[1:]), strict=True):
+                table[...] = rows
+        if isinstance(result, Failure) and isinstance(result.error, WorkerLost):
             raise self._lost(f"lost a worker: {result.error}")
-        return result.of_worker(f"node {self.label}")
+        return result
 
     def close(self) -> None:
         actor, self._actor = self._actor, None
@@ -204,5 +168,4 @@ class NodeWorker(Worker):
             self._cluster.ray.kill(actor)
 
     def _lost(self, cause: str) -> WorkerLost:
-        place = "" if self.info is None else f" on {self.info.address}"
-        return WorkerLost(f"node {self.label}{place} {cause}")
+        return WorkerLost(f"node {self._start.label} {cause}")

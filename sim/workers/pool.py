@@ -22,7 +22,7 @@ from batchpid.errors import ClosedError, SingleOwner
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.loop import Failure, first, joined
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.workers.node import NODE_STEPS, Cluster, NodeInfo, NodeWorker
+from batchpid.sim.workers.node import NODE_STEPS, Cluster, NodeWorker
 from batchpid.sim.workers.requests import BUILD, Request, SharedArrays, Start, split
 from batchpid.sim.workers.worker import (
     LocalWorker,
@@ -201,12 +201,6 @@ class WorkerPool(SingleOwner):
         failure = self.run(BUILD).failure
         if failure is not None:
             raise failure.error
-
-    @property
-    def nodes(self) -> tuple[NodeInfo, ...]:
-        """Machines of a cluster, in the order of their envs."""
-        infos = (worker.info for worker in self.workers if isinstance(worker, NodeWorker))
-        return tuple(info for info in infos if info is not None)
 
     def run(self, request: Request) -> Outcome:
         """Execute ``request`` on all workers.

@@ -119,6 +119,12 @@ class Start:
     of the envs.
     """
 
+    @property
+    def label(self) -> str:
+        """Number and envs, for messages."""
+        first = self.first_env + self.envs.start
+        return f"{self.index} (envs {first} to {self.first_env + self.envs.stop - 1})"
+
     def build(self, arrays: Arrays) -> Loop:
         """Return the loop, with the shared arrays (ticks, envs, ...) of the pool's envs."""
         envs = slice(self.first_env + self.envs.start, self.first_env + self.envs.stop)
@@ -129,6 +135,13 @@ def split(num_envs: int, parts: int) -> list[slice]:
     """Return contiguous slices of envs, as equal as they can be."""
     cuts = [num_envs * part // parts for part in range(parts + 1)]
     return [slice(low, high) for low, high in pairwise(cuts)]
+
+
+_IN_USE = (
+    "this Runner is in use: by another thread, by a call that this one interrupted, or by the process"
+    " from which this one was forked; take turns, set flags in signal handlers, and make a Runner"
+    " in each process"
+)
 
 
 class OneCall:
@@ -158,14 +171,13 @@ class OneCall:
         process.
         """
         if self.in_use:
-            raise self._refusal(threading.get_ident(), os.getpid())
+            raise InUseError(_IN_USE)
 
     def begin(self) -> None:
         """Begin a call. Raises as :meth:`check`."""
         me = threading.get_ident()
-        process = os.getpid()
-        if self._user or process != self._owner:
-            raise self._refusal(me, process)
+        if self._user or os.getpid() != self._owner:
+            raise InUseError(_IN_USE)
         # No function was called since the check. CPython switches threads and calls signal handlers
         # at calls of functions and at jumps back alone, so none can run in between.
         self._user = me
@@ -199,13 +211,3 @@ class OneCall:
             else:  # the system's, which ends the process
                 _signal.signal(SIGINT, self._handler)
                 _signal.raise_signal(SIGINT)
-
-    def _refusal(self, me: int, process: int) -> InUseError:
-        if process != self._owner:
-            problem = f"belongs to process {self._owner}, from which this one was forked"
-            return InUseError(f"this Runner {problem}; use it there, or make one here")
-        if self._user == me:
-            remedy = "let a signal handler set a flag, or close it"
-            return InUseError(f"this Runner is in a call that this one interrupted; {remedy}")
-        remedy = "take turns, or make one for each thread"
-        return InUseError(f"this Runner is in a call from another thread; {remedy}")

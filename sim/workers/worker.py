@@ -13,7 +13,6 @@ import contextlib
 import faulthandler
 import fcntl
 import gc
-import json
 import os
 import pickle
 import select
@@ -42,10 +41,7 @@ ONE_THREAD |= {"NPROC": "1", "JAX_CPU_ENABLE_ASYNC_DISPATCH": "0", "JAX_PLATFORM
 """Environment of a process whose BLAS uses one thread, and whose JAX computes on the CPU, on the
 caller's thread.
 """
-_PROGRAM = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); import batchpid.sim.workers.worker"
-    " as w; w.serve()"
-)
+_PROGRAM = "from batchpid.sim.workers.worker import serve; serve()"
 
 
 class WorkerLost(WorkerError):
@@ -102,16 +98,6 @@ class Worker(SingleOwner, ABC):
         limit: float = self._step_limit * steps + self._timeout + patience
         return limit
 
-    @property
-    def label(self) -> str:
-        """Number, process and envs, for messages."""
-        first = self._start.first_env
-        process = "" if self.pid is None else f"pid {self.pid}, "
-        return (
-            f"{self._start.index} ({process}envs {first + self.envs.start} to"
-            f" {first + self.envs.stop - 1})"
-        )
-
 
 class LocalWorker(Worker):
     """Loop in this process."""
@@ -153,7 +139,7 @@ class ProcessWorker(Worker):
         paths = [path for path in sys.path if isinstance(path, str)]
         # Where "" led to, before the caller changed the folder.
         paths.append(str(Path(__file__).parents[3]))
-        environment = os.environ | ONE_THREAD
+        environment = os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join(paths)}
         if native.obstacle():
             environment[native.SWITCH] = "0"  # one warning for all
         with standard_streams_occupied():
@@ -163,14 +149,7 @@ class ProcessWorker(Worker):
                 descriptors = theirs.fileno(), self._shared.fd
                 self._process = process = subprocess.Popen(
                     # -P: without it the working folder comes first, and a json.py in it would run.
-                    [
-                        sys.executable,
-                        "-P",
-                        "-c",
-                        _PROGRAM,
-                        json.dumps(paths),
-                        *map(str, descriptors),
-                    ],
+                    [sys.executable, "-P", "-c", _PROGRAM, *map(str, descriptors)],
                     stdin=subprocess.PIPE,
                     pass_fds=descriptors,
                     env=environment,
@@ -204,13 +183,10 @@ class ProcessWorker(Worker):
 
     def receive(self) -> object:
         try:
-            result = pickle.load(self._answers)
+            return pickle.load(self._answers)
         except (EOFError, OSError, pickle.UnpicklingError) as error:
             self._raise_early(error)
             raise self._lost(error) from error
-        if isinstance(result, Failure):
-            return result.of_worker(f"worker {self.label}")
-        return result
 
     def let_go(self) -> None:
         """Close the pipe in a forked child of the caller, which may live longer than the caller:
@@ -242,7 +218,7 @@ class ProcessWorker(Worker):
                 cause = f"died ({signal.strsignal(-code)})"
             else:
                 cause = f"died (exit code {code})"
-        return WorkerLost(f"worker {self.label} {cause}")
+        return WorkerLost(f"worker {self._start.label} {cause}")
 
 
 _workers = WeakSet[ProcessWorker]()
@@ -317,10 +293,11 @@ def serve() -> None:
 def _serve(connection: socket.socket, memory: int) -> None:
     requests = connection.makefile("rb")
     start, layout = pickle.load(requests)
+    worker = f"worker {start.label}"
     try:
         loop: Loop = start.build(SharedArrays(layout, memory).arrays)
     except Exception as error:
-        connection.sendall(pickle.dumps(failed(error).portable()))
+        connection.sendall(pickle.dumps(failed(error).portable(worker)))
         return
     connection.sendall(pickle.dumps(None))
     # The hot loop makes no reference cycles, so that collections would only cost time.
@@ -335,5 +312,5 @@ def _serve(connection: socket.socket, memory: int) -> None:
             os.sched_yield()
         result = loop.execute(*pickle.load(requests))
         if isinstance(result, Failure):
-            result = result.portable()
+            result = result.portable(worker)
         connection.sendall(pickle.dumps(result))

@@ -3,7 +3,6 @@ NumPy's.
 """
 
 import jax
-import jax.export
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -33,9 +32,8 @@ def rollout(params, setpoint, measurement):
     return jax.lax.scan(body, bp.init(params, measurement[0]), (setpoint, measurement))[1]
 
 
-@pytest.mark.parametrize("transform", ["vmap", "export"])
-def test_functions_of_one_robot(transform, inputs, x64):
-    """Arrays (joints,) in, arrays (joints,) out: under vmap, and from a serialized program."""
+def test_functions_of_one_robot(inputs, x64):
+    """Arrays (joints,) in, arrays (joints,) out: under vmap."""
     params = bp.make_params(JOINTS, kp=40.0, ki=5.0, kd=2.0, effort_limit=9.0, setpoint_weight=0.7)
     run = Inputs(*(rows[:RESET] for rows in inputs[:2]))
     expected = by_steps(params, run)
@@ -50,14 +48,8 @@ def test_functions_of_one_robot(transform, inputs, x64):
         return bp.reset(params, state, state.origin, mask)
 
     mask = jnp.zeros(4, bool)
-    if transform == "export":
-        one = [jnp.asarray(rows[:, 0]) for rows in run[:2]]
-        program = jax.export.export(jax.jit(last_state))(*one)
-        state, efforts = jax.export.deserialize(program.serialize()).call(*one)
-        expected, again = expected[:, 0], kept(state, mask[0])
-    else:
-        state, efforts = jax.vmap(last_state, 1, (0, 1))(*run[:2])
-        again = jax.vmap(kept)(state, mask)
+    state, efforts = jax.vmap(last_state, 1, (0, 1))(*run[:2])
+    again = jax.vmap(kept)(state, mask)
     np.testing.assert_allclose(efforts, expected, rtol=1e-12, atol=1e-11)
     assert isinstance(state, bp.PIDState)
     assert jax.tree.all(jax.tree.map(lambda a, b: (a == b).all(), again, state))

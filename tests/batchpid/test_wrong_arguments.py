@@ -179,7 +179,6 @@ COMBINATIONS = {
     bp.stability_bound: [{"mass_matrix": -np.eye(2)}, {"kp": [1.0, 2.0, 3.0]}],
     ts.inverse_kinematics: [
         {"starts": 0},
-        {"rotation_tolerance": 0.0},
         {"on_failure": "ignore"},
         {"start": np.zeros((2, 2)), "pose": np.tile(np.eye(7)[3], (3, 1))},
     ],

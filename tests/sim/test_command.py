@@ -137,7 +137,7 @@ def test_a_fault_names_the_entry_and_the_env_has_the_neutral_setpoint(arm):
     control, bad = Noting(), goals()
     bad[1, 1], bad[3, 0] = np.nan, np.inf
     with make(arm, control, on_invalid_input="contain") as runner:
-        with pytest.warns(FaultWarning, match="env 1, entry 'z': its setpoint is not finite"):
+        with pytest.warns(FaultWarning, match="env 1, 'z': its setpoint is not finite"):
             failed = runner.step(bad)
         np.testing.assert_array_equal(failed.ok, [True, False, True, False, True])
         faults = [(fault.env, fault.joint, fault.cause) for fault in runner.faults]

@@ -35,12 +35,12 @@ from batchpid.sim import (
     Normal,
     OperationalSpace,
     Randomization,
-    Recorder,
     Robot,
     Runner,
     Snapshot,
     Uniform,
     read_recording,
+    write_recording,
 )
 from batchpid.sim.options.options import OPTIONS
 
@@ -519,9 +519,8 @@ def recorded(case):
     def rollout(runner, given):
         draws, episodes = runner.draws, runner.episodes
         with tempfile.TemporaryDirectory() as folder:
-            with Recorder(path := f"{folder}/run.h5", runner):
-                run = runner.rollout(**given)
-            read = read_recording(path)
+            run = runner.rollout(**given)
+            read = read_recording(write_recording(run, f"{folder}/run.h5"))
         assert read.info.command == runner.command
         expected = dataclasses.replace(run.info, draws=draws, episodes=episodes)
         if runner.options.randomization is None:

@@ -16,7 +16,6 @@ import batchpid as bp
 from batchpid.errors import NotCopyableError
 from batchpid.sim import (
     Randomization,
-    Recorder,
     Robot,
     Runner,
     RunnerOptions,
@@ -161,12 +160,6 @@ def test_a_runner(hinge, workers):
         assert runner.step([0.1]).ok.all()
     with pytest.raises(NotCopyableError):
         copy.copy(runner)  # a closed one, too
-
-
-def test_a_recorder(hinge, tmp_path):
-    with Runner(hinge, 1, workers=0) as runner, Recorder(tmp_path / "run.h5", runner) as recorder:
-        refuses(recorder, "another Recorder")
-        runner.step([0.1])
 
 
 def test_an_environment(hinge):

@@ -22,7 +22,7 @@ from processes import handler, have_ended, send
 from robots import load_bundled
 
 from batchpid.errors import ClosedError, WorkerError
-from batchpid.sim import Recorder, RecoveryWarning, Robot, Runner, read_recording
+from batchpid.sim import RecoveryWarning, Robot, Runner
 
 ROBOT = load_bundled("panda")
 N, SUBSTEPS = 4, 5
@@ -169,7 +169,7 @@ def test_a_lost_worker_is_named_and_the_others_stay():
     with make(2) as runner:
         lost, other = runner.pids
         send(lost, signal.SIGKILL)
-        named = rf"worker 0 \(pid {lost}, envs 0 to 1\) died \(Killed\); replaced"
+        named = r"worker 0 \(envs 0 to 1\) died \(Killed\); replaced"
         with pytest.warns(RecoveryWarning, match=named):
             runner.step(NEAR)
         assert (runner.recoveries, runner.pids[1]) == (1, other)
@@ -343,12 +343,11 @@ def interrupting(*steps):
 
 
 @pytest.mark.parametrize("workers", [0, 1])
-def test_ctrl_c_waits_for_the_request_in_progress(workers, tmp_path):
+def test_ctrl_c_waits_for_the_request_in_progress(workers):
     before = signal.getsignal(signal.SIGINT)
     with (
         acting(interrupting(SUBSTEPS + 2, 3 * SUBSTEPS), workers) as runner,
         acting(lambda step: None, 0) as model,
-        Recorder(tmp_path / "run.h5", runner) as recorder,
     ):
         runner.step(NEAR)
         with pytest.raises(KeyboardInterrupt):
@@ -362,9 +361,7 @@ def test_ctrl_c_waits_for_the_request_in_progress(workers, tmp_path):
         with pytest.raises(KeyboardInterrupt):
             runner.rollout(np.tile(NEAR, (5_000, 1)))
         ticks = round(runner.time / (SUBSTEPS * runner.timestep))
-        recorder.close()
     assert 3 < ticks < 2_000
-    assert len(read_recording(tmp_path / "run.h5").time) == ticks
 
 
 @pytest.mark.parametrize("workers", [0, 1])

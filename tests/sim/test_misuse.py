@@ -43,7 +43,7 @@ def test_a_call_from_another_thread_raises(runner):
     thread = threading.Thread(target=work)
     thread.start()
     try:
-        with pytest.raises(InUseError, match="another thread; take turns"):  # noqa: PT012
+        with pytest.raises(InUseError, match="in use: by another thread"):  # noqa: PT012
             while True:
                 runner.observe()
     finally:
@@ -106,6 +106,6 @@ def test_a_call_from_a_forked_child_raises(runner):
     os.waitpid(child, 0)
     os.close(write)
     with os.fdopen(read) as message:
-        assert message.read().startswith("InUseError: this Runner belongs to process")
+        assert message.read().startswith("InUseError: this Runner is in use")
     assert_identical(runner.observe(), before)
     assert runner.step(TABLE[0]).ok.all()

@@ -22,7 +22,6 @@ from batchpid.sim import (
     OperationalSpace,
     Physics,
     Randomization,
-    Recorder,
     Robot,
     Runner,
     Uniform,
@@ -153,7 +152,6 @@ def test_a_call_with_any_value_changes_nothing_if_it_is_refused(contain):
             "reset": {"qpos": ROW, "qvel": ROW, "mask": np.ones(N, bool), "seed": None},
             "restore": {"snapshot": None},
             "params": {"params": PARAMS},
-            "actuators": {"actuators": None},
         }
         for method, good in calls.items():
             for name, value in product(good, ODD):
@@ -297,7 +295,6 @@ CALLS = [
             ("reset", {"base_twist": np.zeros(6)}),
             ("bodies", {"names": ["ball"]}),
             ("params", {"params": load_bundled("panda").params()}),
-            ("actuators", {"actuators": bp.make_actuators(3, strength=0.9)}),
         ],
     ),
     ({"params": ARM.params(kp=9.0)}, UNUSED),
@@ -337,14 +334,6 @@ def test_a_refused_call_names_its_argument_and_changes_nothing(options, calls):
             assert is_refused(runner, partial(act, runner, name, arguments), next(iter(arguments)))
         size = runner.options.command.size
         assert runner.step(np.zeros(size) if runner.robot.fixed_base else start.qpos).ok.all()
-
-
-@pytest.mark.parametrize("arguments", [("run.txt",), (3,), ("run.h5", None)])
-def test_a_recorder_that_is_refused_is_not_attached(arguments):
-    with Runner(**GOOD[Runner]) as runner:
-        with pytest.raises(BatchPIDError):
-            Recorder(*(*arguments, runner)[:2])
-        assert runner.recorder is None
 
 
 @pytest.mark.parametrize(

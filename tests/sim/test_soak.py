@@ -6,7 +6,7 @@ import numpy as np
 import psutil
 import pytest
 
-from batchpid.sim import Recorder, Runner, read_recording
+from batchpid.sim import Runner
 
 SECONDS = float(os.environ.get("BATCHPID_SOAK_SECONDS", "30"))
 # These are 4 million env steps: some minutes. An hour of simulated time takes hours.
@@ -36,7 +36,7 @@ def run(runner, ticks, after_tick):
 
 
 @pytest.mark.slow
-def test_hours_leave_memory_flat(panda, tmp_path):
+def test_hours_leave_memory_flat(panda):
     ticks, used = max(60, round(SECONDS / TICK)), {}
     options = {"timestep": TIMESTEP, "physics": PHYSICS, "substeps": round(TICK / TIMESTEP)}
     with Runner(panda, NUM_ENVS, params=panda.params(), workers=2, **options) as runner:
@@ -45,8 +45,7 @@ def test_hours_leave_memory_flat(panda, tmp_path):
             if tick % 10 == 0:
                 used[tick] = memory(runner)
 
-        with Recorder(tmp_path / "run.h5", runner):
-            run(runner, ticks, note_memory)
+        run(runner, ticks, note_memory)
         assert (len(runner.faults), runner.recoveries) == (0, 0)
     early = max(size for tick, size in used.items() if ticks // 10 <= tick < ticks // 4)
     late = max(size for tick, size in used.items() if tick >= 3 * ticks // 4)
@@ -54,6 +53,3 @@ def test_hours_leave_memory_flat(panda, tmp_path):
     # It takes some minutes until all that stays has been touched.
     warming_up = 0 if ticks >= 30_000 else 8 << 20
     assert late <= 1.02 * early + warming_up
-    recording = read_recording(tmp_path / "run.h5")
-    assert recording.info.complete
-    assert np.ptp(recording.qpos[:, :, 0], axis=0).min() > 0.1

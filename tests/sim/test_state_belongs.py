@@ -172,17 +172,16 @@ def test_a_snapshot_under_any_two_options_is_refused_or_goes_on_as_before(exampl
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_a_drawn_start_is_the_first_setpoint(mode):
+def test_a_drawn_start_is_the_first_setpoint():
     drawn = Randomization(qpos=Uniform(-0.2, 0.2))
     options = {"workers": 0, "actions": "increment", "engine": "mujoco", "max_episode_steps": 3}
-    env = ReachVectorEnv(2, randomization=drawn, autoreset_mode=mode, **options)
+    env = ReachVectorEnv(2, randomization=drawn, **options)
     with env.runner:
         env.reset(seed=1)
         start, ended = env.observed.qpos, False
         for _ in range(8):
             *_, truncated, _ = env.step(np.zeros(env.action_space.shape, np.float32))
-            if truncated.any() or (ended and mode == "NextStep"):
+            if truncated.any() or ended:
                 start = env.observed.qpos
             else:
                 assert np.abs(env.observed.qpos - start).max() < 0.02

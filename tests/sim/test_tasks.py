@@ -19,8 +19,8 @@ class Swing(RobotVectorEnv):
 
     returned = None  # another value of a hook, by name
 
-    def runner_options(self):
-        return {"control": "effort"}
+    def __init__(self, num_envs, *arguments, **options):
+        super().__init__(num_envs, *arguments, control="effort", **options)
 
     def spaces(self):
         return spaces.Box(-50, 50, (2,)), spaces.Box(-3.0, 3.0, (1,), np.float32)
@@ -76,7 +76,7 @@ def hinge(tmp_path_factory):
 @pytest.fixture
 def swings(hinge):
     envs = Swing(
-        3, hinge, workers=0, rate_hz=100.0, autoreset_mode="SameStep", max_episode_steps=20
+        3, hinge, workers=0, rate_hz=100.0, autoreset_mode="Disabled", max_episode_steps=20
     )
     yield envs
     envs.close()
@@ -90,13 +90,12 @@ def test_a_task_is_defined_by_its_hooks(swings):
         before = observation[:, 0]
         observation, reward, terminated, truncated, info = swings.step(actions)
         assert swings.action.ravel().tolist() == [3.0, -3.0, 0.0]
-        final = np.where(info.get("_final_obs", np.zeros(3, bool)), 0, observation[:, 0])
-        np.testing.assert_allclose(
-            reward[final != 0], (final - [0.09, 0.09, 0.0])[final != 0], atol=1e-6
-        )
+        np.testing.assert_allclose(reward, observation[:, 0] - [0.09, 0.09, 0.0], atol=1e-6)
         ends |= {(env, "terminated") for env in np.flatnonzero(terminated)}
         ends |= {(env, "truncated") for env in np.flatnonzero(truncated)}
         assert (info["success"] == (observation[:, 0] > 0.2)).all()
+        if (terminated | truncated).any():
+            observation, _ = swings.reset(options={"reset_mask": terminated | truncated})
     assert before.shape == (3,)
     assert ends >= {(1, "terminated"), (2, "truncated")}
     assert not any(env == 0 and how == "terminated" for env, how in ends)  # success does not end it
@@ -112,12 +111,8 @@ def test_an_effort_is_zero_until_the_first_action(swings):
 @pytest.mark.parametrize(
     ("hook", "value"),
     [
-        ("draw", np.zeros(2)),
         ("observe", np.zeros((3, 1))),
         ("observe", np.array([[0.0, 0], [0, np.nan], [0, 0]])),
-        ("command", np.zeros(3)),
-        ("rate", np.zeros(3)),
-        ("rate", np.full((3, 1), np.inf)),
         ("success", np.zeros((3, 1), bool)),
         ("reward", 0.0),
         ("reward", np.array([0, np.inf, 0])),
@@ -129,9 +124,26 @@ def test_a_wrong_result_of_a_hook_is_named(swings, hook, value):
     swings.reset(seed=0)
     swings.returned = hook, value
     with pytest.raises(InvalidArgumentError, match=f"^Swing.{hook}: "):
-        swings.reset() if hook == "draw" else swings.step(np.zeros((3, 1)))
+        swings.step(np.zeros((3, 1)))
     swings.returned = None
     swings.reset(seed=0)  # the task goes on
+    assert np.isfinite(swings.step(np.zeros((3, 1)))[0]).all()
+
+
+@pytest.mark.parametrize(
+    ("hook", "value", "argument"),
+    [
+        ("command", np.zeros(3), "setpoint"),
+        ("rate", np.zeros(3), "setpoint_rate"),
+        ("rate", np.full((3, 1), np.inf), "setpoint_rate"),
+    ],
+)
+def test_the_runner_checks_commands(swings, hook, value, argument):
+    swings.reset(seed=0)
+    swings.returned = hook, value
+    with pytest.raises(InvalidArgumentError, match=f"^{argument}"):
+        swings.step(np.zeros((3, 1)))
+    swings.returned = None
     assert np.isfinite(swings.step(np.zeros((3, 1)))[0]).all()
 
 
@@ -178,35 +190,9 @@ def test_setpoints_are_steps_unless_a_task_gives_their_rates(hinge, task):
     envs.close()
 
 
-class Wink(Nod):
-    """A hinge whose setpoint depends on how often it was asked for."""
-
-    asked = 0
-
-    def command(self, action, setpoint):
-        self.asked += 1
-        return setpoint + 0.02 * action * self.asked
-
-
-def test_a_command_with_a_state_executes_whole_chunks(hinge):
-    """Rows that are not executed would count."""
-    for task, execute in ((Nod, 2), (Wink, 4), (Wink, 2)):
-        envs = task(1, hinge, workers=0, chunk=4, execute=execute)
-        envs.reset(seed=0)
-        if (task, execute) == (Wink, 2):
-            with pytest.raises(InvalidArgumentError, match=r"^execute: Wink.command gives another"):
-                envs.step(np.ones((1, 4, 1)))
-        else:
-            envs.step(np.ones((1, 4, 1)))
-        envs.close()
-
-
-def test_options_that_a_task_chooses_are_refused(hinge):
+def test_a_task_needs_its_hooks():
     with pytest.raises(TypeError, match="observe"):
         RobotVectorEnv(1)
-    with pytest.raises(InvalidArgumentError) as caught:
-        Swing(1, hinge, control="pid")
-    assert caught.value.argument == "control"
 
 
 def test_torchrl_wraps_tasks_that_do_not_reset_themselves(hinge):

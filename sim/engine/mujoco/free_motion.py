@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import ctypes
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
 from typing import Any
 
@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64, MjData, MjModel, Rows
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
-from batchpid.sim.engine.mujoco.mujoco_sensors import wrench_tables
 from batchpid.sim.engine.native import FARTHEST, WIDTH, number, structure
 from batchpid.sim.engine.native_model import NativeModel, aligned, table
 
@@ -332,8 +331,10 @@ class FreeMotions:
             sensed=sensed.shape[1],
         )
 
-    def use(self, models: Sequence[MjModel]) -> None:
-        """Take the constants of the robots' models (M,), which may have changed."""
+    def use(self, models: Sequence[MjModel], wrenches: Mapping[str, Rows]) -> None:
+        """Take the constants of the robots' models (M,), which may have changed, and their
+        :func:`.wrench_tables`.
+        """
         at = self._robot.qvel
         kinds = models[:1] if all(model is models[0] for model in models) else models
         columns = {
@@ -349,8 +350,7 @@ class FreeMotions:
                 "drive_limit": [model.actuator_forcerange[:, 1] for model in kinds],
             }
         self._arrays |= {name: table(np.array(rows), self.size) for name, rows in columns.items()}
-        if self._structure.wrenches:
-            self._arrays |= wrench_tables(self._robot, self._rigid.tables, models)
+        self._arrays |= wrenches
         # In place, since native code has the address.
         self._structure.model = self._rigid.address
         for name, array in self._arrays.items():

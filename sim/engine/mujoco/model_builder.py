@@ -83,9 +83,8 @@ class RobotMj:
 
 
 @lru_cache(maxsize=8)
-def robot_model(spec: SceneSpec, drives: bool = False) -> RobotMj:
-    """Return the model of ``spec``, with a drive of every joint if asked; the same object for equal
-    arguments.
+def robot_model(spec: SceneSpec) -> RobotMj:
+    """Return the model of ``spec``, the same object for equal specs.
 
     Raises
     ------
@@ -93,9 +92,9 @@ def robot_model(spec: SceneSpec, drives: bool = False) -> RobotMj:
         MuJoCo's compiler refuses the description, or a mesh cannot be read.
     """
     if spec.mjcf is not None:
-        return _file_model(spec, spec.mjcf, drives)
+        return _file_model(spec, spec.mjcf)
     scene, names = robot_spec(spec)
-    if drives:
+    if spec.drives:
         _add_drives(scene, spec)
     try:
         model = scene.compile()
@@ -121,7 +120,7 @@ def _places(model: MjModel, spec: SceneSpec) -> tuple[NDArray[np.intp], NDArray[
     return qpos, qvel
 
 
-def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
+def _file_model(spec: SceneSpec, file: MjcfFile) -> RobotMj:
     """Return the model of a file, with the damping of the robot's joints, and without their
     friction and motors.
     """
@@ -138,7 +137,7 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
         option.disableflags |= off.mjDSBL_CONTACT
     set_ground(scene, spec.ground)
     add_link_sensors(scene, spec, names, frames)
-    if drives:
+    if spec.drives:
         _add_drives(scene, spec)
     try:
         model = scene.compile()

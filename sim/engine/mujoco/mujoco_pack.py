@@ -16,19 +16,16 @@ import numpy as np
 
 from batchpid.arrays.array_types import Bool, Float64, MjData, Rows
 from batchpid.motors import Actuators
-from batchpid.sim.description.merging import coupling_of
 from batchpid.sim.description.tables import CONTACT_FRICTION
-from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.mujoco.file_scene import check_links
 from batchpid.sim.engine.mujoco.free_motion import FreeMotions, place_of_contacts
 from batchpid.sim.engine.mujoco.model_builder import (
     FLOATING,
     LARGEST_FORCE,
-    RobotMj,
     robot_model,
     set_inertia,
 )
-from batchpid.sim.engine.mujoco.mujoco_sensors import MujocoLinkSensors
+from batchpid.sim.engine.mujoco.mujoco_sensors import MujocoLinkSensors, wrench_tables
 from batchpid.sim.engine.mujoco.mujoco_step import STATE, DataPool, MujocoStep, obstacle, rest
 from batchpid.sim.engine.native import FARTHEST
 from batchpid.sim.engine.protocol import BASE_AT_REST, Engine, EnginePack
@@ -55,31 +52,22 @@ class MujocoPack(EnginePack):
         workspace: dict[object, DataPool] | None = None,
     ) -> None:
         super().__init__(spec, size, first_env, variation, not obstacle())
-        self._workspace = {} if workspace is None else workspace
         varied = self._variation
         self._worlds_vary = varied.ground_friction is not None or varied.gravity is not None
         self.qf = np.zeros((size, self.dof))
-        self._actuators: Actuators | None = None
-        coupling = coupling_of(spec.joints)
-        viscous = self.friction.viscous
-        if not coupling.is_identity and spec.mjcf is None:  # else MuJoCo has the file's equalities
-            self._constraint = ConstraintEfforts(
-                size, coupling, np.zeros(self.dof, bool), spec.timestep
-            )
-            self._constraint.implicit[...] = spec.timestep * (0.0 if viscous is None else viscous)
-        if spec.mjcf is not None:
+        if spec.mjcf is None:  # else MuJoCo has the file's equalities
+            reads = self.spec.fixed_base and self.steps_read_force(True, True)
+            self._couple(np.zeros(self.dof, bool), None if reads else self.joint_model)
+        else:
             links = *(spec.contacts or ()), *(spec.wrenches or ()), spec.carrier
             check_links(spec, spec.mjcf, filter(None, links))
         self._stiffness = self._rate_gain = self._target_rate = np.zeros((1, self.dof))
-        self._make_data(robot_model(spec))
-        if variation is not None:
-            self.write_joints(None)
-
-    def _make_data(self, robot: RobotMj) -> None:
-        """Make the robots, with their masses."""
-        if robot not in self._workspace:
-            self._workspace[robot] = DataPool(robot)
-        self._robot, self._pool = robot, self._workspace[robot]
+        self._robot = robot = robot_model(spec)
+        if workspace is None:
+            workspace = {}
+        if robot not in workspace:
+            workspace[robot] = DataPool(robot)
+        self._pool = workspace[robot]
         self._sensors = MujocoLinkSensors(self.spec, robot.model, robot.bodies)
         self._sensed = np.zeros((self.size, self._sensors.size))
         self.models, self.rows = [self._pool.model] * self.size, self._pool.initial(self.size)
@@ -87,12 +75,11 @@ class MujocoPack(EnginePack):
         self._free: FreeMotions | None = None
         if self.steps_natively and self._moves_freely:
             self._free = FreeMotions(robot, self.joint_model, self._sensed)
-        if self._constraint is not None and self.steps_natively:
-            force = None if self._reads_bias else self.joint_model
-            self._constraint.use(self.joint_model, force)
         self._change_world(range(self.size))
         self._change_masses(range(self.size))
         self._update(range(self.size))
+        if variation is not None:
+            self.write_joints(None)
 
     @property
     def _moves_freely(self) -> bool:
@@ -118,7 +105,10 @@ class MujocoPack(EnginePack):
         if self._free is None:
             self._evaluate(rows)
         else:
-            self._free.use(self.models)
+            wrenches = {}
+            if self.spec.wrenches:
+                wrenches = wrench_tables(self.spec, self._masses.added, self.size)
+            self._free.use(self.models, wrenches)
         self.calls = object()
         self._own_step: MujocoStep | None = None
 
@@ -155,13 +145,6 @@ class MujocoPack(EnginePack):
                 return self._force(self.force_model, True, True)
             return np.array([data.qfrc_bias[self._moves] for data in self.data])
         return self._force(self.force_model, gravity, coriolis)
-
-    @property
-    def _reads_bias(self) -> bool:
-        """Whether the forces in the equations of motion are the passive force, with the bits that
-        native steps read.
-        """
-        return self.spec.fixed_base and self.steps_read_force(True, True)
 
     # -- stepping
     # ----------------------------------------------------------------------------------------------
@@ -209,14 +192,10 @@ class MujocoPack(EnginePack):
             self._free,
         )
 
-    def update_constraint(self, rows: Sequence[int] | slice = slice(None)) -> None:
-        if self._constraint is None:
-            return
-        if self._reads_bias:
-            bias = self.passive_force(True, True)
-        else:
-            bias = self._force(self.joint_model, True, True)
-        self._constraint.update(self.joint_model.mass_matrix, self.read_qpos(), bias, rows)
+    def _bias(self) -> Float64:
+        if self.spec.fixed_base and self.steps_read_force(True, True):
+            return self.passive_force(True, True)
+        return self._force(self.joint_model, True, True)
 
     # -- changes
     # ----------------------------------------------------------------------------------------------
@@ -319,7 +298,6 @@ class MujocoPack(EnginePack):
         self._suspended[...] = mask
 
     def write_joints(self, actuators: Actuators | None, rows: Sequence[int] | None = None) -> None:
-        self._actuators = actuators
         armature, damping = self._robot.terms
         values = {"dof_armature": np.maximum(armature + self._add_joints(actuators), 0.0)}
         if self.spec.mjcf is not None and self._variation.damping is not None:
@@ -408,18 +386,13 @@ class MujocoPack(EnginePack):
         self._change_model(rows)
 
     def write_drive(self, stiffness: Rows, damping: Rows, force_limit: Rows) -> None:
-        """Set the drive of every joint; each argument broadcasts to (M, dof).
+        """Set the drive of every joint, of a spec with drives; each argument broadcasts to (M,
+        dof).
 
         They are MuJoCo's actuators, implicit in the time step dt as PhysX's are: with the velocity
         v+ after it, the effort kp (r - q - dt v+) + kd (r' - v+) is a drive's with stiffness kp and
         implicit damping kd + dt kp.
         """
-        if self._robot.model.nu == 0:
-            states = self.read_state()
-            self._release()
-            self._make_data(robot_model(self.spec, drives=True))
-            self.write_joints(self._actuators)
-            self.write_state_rows(states)
         limit = np.broadcast_to(np.minimum(force_limit, LARGEST_FORCE), self.qf.shape)
         self._stiffness, self._rate_gain = (
             np.broadcast_to(table, self.qf.shape).copy() for table in (stiffness, damping)
@@ -476,17 +449,8 @@ class MujocoPack(EnginePack):
         return [np.hstack([data.xpos[numbers], data.xquat[numbers]]) for data in self.data]
 
     def close(self) -> None:
-        self._release()
-        self.models = []
-
-    def _release(self) -> None:
-        """Give back all that fits the present kind of model alone: working memory, and data made
-        for its size.
-        """
         self._pool.leave(self.rows if self._free is None else self._free)
-        self._own_step = None
-        for name in ("_scratch", "_rubbing"):
-            self.__dict__.pop(name, None)
+        self.models = []
 
 
 @contextmanager

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING
+from dataclasses import replace
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Bool, Float64, MjModel, MjsBody, MjSpec, Rows
+from batchpid.arrays.array_types import Float64, MjModel, MjsBody, MjSpec, Rows
 from batchpid.sim.engine.mujoco.file_scene import BodyFrame
 from batchpid.sim.engine.scene_spec import SceneSpec
-
-if TYPE_CHECKING:
-    from batchpid.sim.engine.mujoco.model_builder import RobotMj
 
 _FOUND_AND_FORCE = 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND) | 1 << int(
     mujoco.mjtConDataField.mjCONDATA_FORCE
@@ -79,64 +75,31 @@ def _parts(body: MjsBody, others: set[str]) -> Iterator[MjsBody]:
             yield from _parts(child, others)
 
 
-def wrench_tables(
-    robot: RobotMj,
-    tables: tuple[NDArray[np.int32], Float64],
-    models: Sequence[MjModel],
-) -> dict[str, Rows]:
+def wrench_tables(spec: SceneSpec, added: Mapping[str, Float64], size: int) -> dict[str, Rows]:
     """Return the tables of the links whose wrenches are measured for ``FreeMotion`` in
-    ``free_motion.h``, for robots with the ``tables`` of their tree and these ``models``.
+    ``free_motion.h``, for ``size`` robots with the inertias :attr:`.VariedMasses.added`.
     """
-    model = robot.model
-    sites = model.sensor_objid[model.sensor_type == mujoco.mjtSensor.mjSENS_FORCE]
-    links, welded = model.site_bodyid[sites], model.body_weldid
-    movers = model.dof_bodyid[robot.qvel]
-    joints = np.full(model.nbody, -1, np.int32)
-    joints[movers] = np.arange(len(movers))
-    carriers = joints[welded[links]]
-    # Frames of the tree with all joints at 0; the last one is the base's, with number -1.
-    turns, places = np.tile(np.eye(3), (len(movers) + 1, 1, 1)), np.zeros((len(movers) + 1, 3))
-    for joint, ((above, _), row) in enumerate(zip(*tables, strict=True)):
-        turns[joint] = turns[above] @ row[:9].reshape(3, 3)
-        places[joint] = places[above] + turns[above] @ row[9:12]
-    turns, places = turns[carriers], places[carriers]
-    # Bodies of a link, and below it.
-    inside = np.arange(model.nbody) == links[:, None]
-    for body in range(1, model.nbody):
-        inside[:, body] |= inside[:, model.body_parentid[body]]
-    inside &= welded == welded[links][:, None]
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    axes = np.swapaxes(data.site_xmat[sites].reshape(-1, 3, 3), 1, 2) @ turns
-    origins = np.einsum("lij,li->lj", turns, data.site_xpos[sites] - places)
-    carried = [
-        [
-            _inertia(variant, bodies, turn, place)
-            for bodies, turn, place in zip(inside, turns, places, strict=True)
-        ]
-        for variant in models
-    ]
-    return {
-        "carriers": carriers,
-        "hanging": inside[:, model.body_parentid[movers]].astype(np.int32, order="C"),
-        "frames": np.hstack([axes.reshape(-1, 9), origins]),
-        "carried": np.array(carried),
-    }
-
-
-def _inertia(model: MjModel, bodies: Bool, turn: Float64, place: Float64) -> Float64:
-    """Return mass, center and tensor about it (13,) of ``bodies``, in a frame, with the joints at
-    0.
-    """
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    masses, centers = model.body_mass[bodies], data.xipos[bodies]
-    center = masses @ centers / masses.sum()
-    apart = centers - center
-    axes = data.ximat[bodies].reshape(-1, 3, 3)
-    tensor = np.einsum("bik,bk,bjk->ij", axes, model.body_inertia[bodies], axes)
-    tensor += np.sum(masses * (apart**2).sum(1)) * np.eye(3) - (masses * apart.T) @ apart
-    return np.hstack([masses.sum(), (center - place) @ turn, (turn.T @ tensor @ turn).ravel()])
+    tree = spec.rigid_tree
+    is_fixed = np.array(tree.joint_types) == "fixed"
+    parents = np.asarray(tree.parent)
+    tables: dict[str, list[Rows]] = {"carriers": [], "hanging": [], "frames": [], "carried": []}
+    for name in spec.wrenches or ():
+        link = tree.index(name)
+        # The link, and all that fixed joints hold to it.
+        inside = np.arange(len(parents)) == link
+        for held in np.flatnonzero(is_fixed[1:]) + 1:
+            inside[held] |= inside[parents[held]]
+        part = replace(tree, mass=inside * tree.mass, inertia=inside[:, None, None] * tree.inertia)
+        varied = {link: rows for link, rows in added.items() if inside[tree.index(link)]}
+        inertias = part.inertias(part.varied(varied) if varied else None)
+        carrier = tree.link_bodies[link]
+        frame = tree.bodies.link_frames[link]
+        tables["carriers"].append(np.array(carrier, np.int32))
+        tables["hanging"].append(inside[parents[~is_fixed]].astype(np.int32))
+        tables["frames"].append(np.hstack([frame[:, :3].T.ravel(), frame[:, 3]]))
+        tables["carried"].append(np.broadcast_to(inertias[..., carrier, :], (size, 13)))
+    stacked = {name: np.array(rows) for name, rows in tables.items()}
+    return stacked | {"carried": np.swapaxes(stacked["carried"], 0, 1).copy()}
 
 
 class MujocoLinkSensors:

@@ -28,7 +28,6 @@ __all__ = [
     "FARTHEST",
     "SWITCH",
     "WIDTH",
-    "describe_calls",
     "extension",
     "number",
     "obstacle",
@@ -67,13 +66,6 @@ def obstacle() -> str:
     :meth:`Engine.native_obstacle`.
     """
     return array_program.obstacle(*EXTENSIONS.values())
-
-
-def describe_calls(engine: str, obstacle: str) -> str:
-    """Return the kind of the calls into ``engine``, with the ``obstacle`` to native ones."""
-    if obstacle:
-        return f"Python calls into {engine} ({obstacle})"
-    return f"native calls into {engine}"
 
 
 def extension(name: str) -> ModuleType:

@@ -16,7 +16,7 @@ from batchpid.arrays.array_types import Float64
 from batchpid.errors import RobotError
 from batchpid.sim.description.tables import CONTACT_FRICTION
 from batchpid.sim.engine.sapien.limits import filter_words
-from batchpid.sim.engine.sapien.user_content import Frames, HeadlessScene
+from batchpid.sim.engine.sapien.user_content import HeadlessScene
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.geometry.shapes import Shape, hull
 from batchpid.task_space.frames import SpatialInertia, matrix_of
@@ -236,12 +236,3 @@ def _add_shapes(spec: SceneSpec, robot: physx.PhysxArticulation) -> None:
         built = _collision_shape(shape)
         built.set_collision_groups(words[shape.owner])
         links[shape.body].attach(built)
-
-
-def link_frames(spec: SceneSpec, robot: physx.PhysxArticulation) -> Frames:
-    """Return all links of the URDF, in the entities of ``robot``, which is one of ``spec``."""
-    entities = {link.name: link.entity for link in robot.links}
-    return {
-        name: (entities[at.link], None if at.link == name else Pose(at.position, at.wxyz))
-        for name, at in spec.simulated.links.items()
-    }

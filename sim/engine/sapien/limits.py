@@ -3,19 +3,16 @@ the robot's file says.
 
 PhysX ignores pairs of links by its filter. Each shape has four words of 32 bits. As SAPIEN sets the
 filter up, two shapes are ignored if the upper halves of word 3 differ, or if they share a bit of
-word 2 and the lower half of word 3. Else they may touch if word 0 of one shares a bit with word 1
-of the other.
+word 2 and the lower half of word 3. Else they may touch, with words 0 and 1 by default.
 
 The pairs to ignore are the edges of a graph of bodies. Each bit of word 2 ignores all pairs within
 a clique, so that it takes an edge clique cover (L. T. Kou, L. J. Stockmeyer and C. K. Wong,
 "Covering edges by cliques with regard to keyword conflicts and intersection graphs", Comm. ACM 21,
-1978, whose greedy method this is). What 32 cliques leave over, bits of words 0 and 1 ignore, one
-for each body of a vertex cover.
+1978, whose greedy method this is). What 32 cliques leave over collides.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from functools import lru_cache
 from itertools import combinations
@@ -34,9 +31,7 @@ Pair = frozenset[str]
 """Names of two bodies."""
 
 _ROBOT = 0xFFFF  # lower half of word 3: bits of word 2 in the user's content mean something else
-_CONTENT = 1  # bit of words 0 and 1 that every shape has by default
-_OTHERS = 1 << 31  # bit of words 0 and 1 of the bodies outside the vertex cover
-_MAX_CLIQUES, _MAX_STARS = 32, 30
+_MAX_CLIQUES = 32
 _PARALLEL = 0.99
 """Cosine of the angle between a wheel's axis and the axis of its cylinder, from which it rolls."""
 _MUJOCO = "use the engine 'mujoco'"
@@ -115,29 +110,11 @@ def collision_groups(
     cliques = _cliques(bodies, ignored, free)
     # The largest cliques first: what is left over is then the least.
     cliques = sorted(cliques, key=lambda clique: -len(_within(clique, ignored)))[:_MAX_CLIQUES]
-    by_words_0_and_1 = set(ignored).difference(*(_within(clique, ignored) for clique in cliques))
-    left = by_words_0_and_1
-    stars = list[str]()
-    while left and len(stars) < _MAX_STARS:
-        degree = Counter(body for pair in left for body in pair)
-        centre = max(bodies, key=lambda body: degree[body])  # the first of the largest
-        stars.append(centre)
-        left = {pair for pair in left if centre not in pair}
-
+    left = set(ignored).difference(*(_within(clique, ignored) for clique in cliques))
     words = {}
     for body in bodies:
-        zero = one = _CONTENT
-        if stars:
-            # With stars the default bit would let every pair touch.
-            one = 0
-            for number, centre in enumerate(stars, start=1):
-                zero |= (centre == body) << number
-                one |= (frozenset((centre, body)) not in by_words_0_and_1) << number
-            if body not in stars:
-                zero = zero | _OTHERS
-                one = one | _OTHERS
         two = sum(1 << number for number, clique in enumerate(cliques) if body in clique)
-        words[body] = (zero, one, two, _ROBOT)
+        words[body] = (1, 1, two, _ROBOT)
     return words, frozenset(left)
 
 

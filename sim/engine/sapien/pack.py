@@ -21,21 +21,18 @@ from sapien import Pose, physx
 
 from batchpid.arrays.array_types import Bool, Float32, Float64, Rows
 from batchpid.motors import Actuators
-from batchpid.sim.description.merging import coupling_of
-from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.native import FARTHEST
 from batchpid.sim.engine.protocol import BASE_AT_REST, Engine, EnginePack
 from batchpid.sim.engine.sapien.building import (
     RESTITUTION,
     build_scene,
     engine_settings,
-    link_frames,
     new_system,
     set_inertia,
 )
 from batchpid.sim.engine.sapien.calls import SapienStep, obstacle
 from batchpid.sim.engine.sapien.limits import refusals, shortfalls
-from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, write_root
+from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_body, write_root
 from batchpid.sim.engine.scene_spec import PHYSICS, SceneSpec, Variation
 from batchpid.task_space.frames import matrix_of, unrotate
 
@@ -71,27 +68,16 @@ class Pack(EnginePack):
         if spec.build is not None:
             with engine_settings(spec):
                 envs = enumerate(self._scenes, start=first_env)
-                frames = [link_frames(spec, robot) for robot in self.robots]
-                self._contents = [
-                    SceneContent(spec, spec.build, scene, env, frames[env - first_env])
-                    for env, scene in envs
-                ]
-            self.content = np.array([content.digest for content in self._contents])
+                self._contents = [SceneContent(spec.build, scene, env) for env, scene in envs]
         self._damping = np.array([[joint.damping for joint in self.robots[0].active_joints]])
         self.qf = np.zeros((size, self.dof), np.float32)
-        coupling = coupling_of(spec.joints)
+        continuous = np.array([joint.continuous for joint in spec.joints], bool)
+        self._couple(continuous, None, self.qf)
         self._joint_qf = self.qf
         self._turning = np.array([], np.intp)
-        if not coupling.is_identity:
+        if self._constraint is not None:
             self._joint_qf = np.zeros_like(self.qf)
-            continuous = np.array([joint.continuous for joint in spec.joints])
             self._turning = np.flatnonzero(continuous)
-            self._constraint = ConstraintEfforts(size, coupling, continuous, spec.timestep, self.qf)
-            self._constraint.implicit[...] = [
-                [joint.armature[0] for joint in self.robots[0].active_joints]
-            ]
-            if self.steps_natively:
-                self._constraint.use(self.joint_model, None)
         self._bind()
         if variation is not None:
             self.write_joints(None)
@@ -151,10 +137,8 @@ class Pack(EnginePack):
             constraint=self._constraint_address,
         )
 
-    def update_constraint(self, rows: Sequence[int] | slice = slice(None)) -> None:
-        if self._constraint is not None:
-            passive = self._own_force(True, True)
-            self._constraint.update(self.joint_model.mass_matrix, self.read_qpos(), passive, rows)
+    def _bias(self) -> Float64:
+        return self._own_force(True, True)
 
     def _renew(self, rows: Sequence[int]) -> None:
         """Rebuild the robots ``rows`` in new systems, in which earlier contacts have no influence
@@ -222,13 +206,13 @@ class Pack(EnginePack):
         return np.array(~(np.abs(self.read_base()) <= FARTHEST).all(1))
 
     def read_base(self) -> Float64:
-        roots = np.array([read_root(robot) for robot in self.robots], np.float64)
+        roots = np.array([read_body(robot.root) for robot in self.robots], np.float64)
         return self._moved_to_origin(range(self.size), roots, -1.0)
 
     def read_base_motion(self) -> Float64 | None:
         if self.spec.fixed_base:
             return None
-        roots = np.array([read_root(robot) for robot in self.robots], np.float64)
+        roots = np.array([read_body(robot.root) for robot in self.robots], np.float64)
         turn = matrix_of(roots[:, 3:7])
         parts = np.array(self.spec.gravity), roots[:, 10:]
         return np.concatenate([unrotate(turn, part) for part in parts], axis=1)
@@ -355,26 +339,21 @@ class Pack(EnginePack):
                 joint.set_pose_in_parent(frames[0])
                 joint.set_pose_in_child(frames[1])
 
-    def state_sizes(self) -> list[int]:
-        """Return the number of values in the state of each scene: of the robot, and of its
-        content.
-        """
-        robot = 2 * self.dof + ROOT_SIZE + self._turning.size
-        return [robot + content.size for content in self._contents] or [robot] * self.size
-
     def read_state(self) -> Float64:
         """Return the state of each scene (M, values): qpos, qvel, root, positions without jumps of
         coupled continuous joints, content, then NaN.
         """
-        sizes = self.state_sizes()
-        states = np.full((self.size, max(sizes)), np.nan)
+        rows = []
         for row, robot in enumerate(self.robots):
             content = [scene.read() for scene in self._contents[row : row + 1]]
             turned = (
                 [] if self._constraint is None else self._constraint.unwrapped[row, self._turning]
             )
-            parts = robot.get_qpos(), robot.get_qvel(), read_root(robot), turned, *content
-            states[row, : sizes[row]] = np.concatenate(parts)
+            parts = robot.get_qpos(), robot.get_qvel(), read_body(robot.root), turned, *content
+            rows.append(np.concatenate(parts, dtype=np.float64))
+        states = np.full((self.size, max(map(len, rows))), np.nan)
+        for state, values in zip(states, rows, strict=True):
+            state[: len(values)] = values
         return states
 
     def write_state_rows(self, states: Float64) -> None:

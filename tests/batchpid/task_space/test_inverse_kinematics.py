@@ -83,8 +83,6 @@ def test_a_point_of_a_link_is_a_tool():
     pose[:, :3] += frames.rotate(frames.matrix_of(pose[:, 3:]), point)
     found = ts.inverse_kinematics(tree, TOOLS["panda"], pose, qpos + 0.05, point=point)
     assert found.success.all()
-    assert (found.start == 0).all()
-    assert "10 of 10" in repr(found)
 
 
 def test_the_result_of_an_env_does_not_depend_on_the_others():
@@ -93,7 +91,6 @@ def test_the_result_of_an_env_does_not_depend_on_the_others():
     pose[3, 0] += 3.0
     whole = ts.inverse_kinematics(tree, TOOLS["panda"], pose, start, starts=5, on_failure="return")
     assert not whole.success[3]
-    assert (whole.start > 0).any()
     for rows in (slice(3, 4), slice(0, 5), slice(8, 12)):
         part = ts.inverse_kinematics(
             tree, TOOLS["panda"], pose[rows], start, starts=5, on_failure="return"

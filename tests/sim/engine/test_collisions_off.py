@@ -74,16 +74,3 @@ def test_robots_pass_through_the_ground_and_without_a_warning(falling):
         for given in (True, False)
     ]
     assert lowest[1] > lowest[0] + 0.3
-
-
-def test_content_without_shapes_is_allowed(panda):
-    with Runner(
-        panda,
-        2,
-        engine="sapien",
-        workers=0,
-        collisions=False,
-        build=lambda scene, env: "panda_hand",
-    ) as runner:
-        runner.step(panda.settings.target)
-        assert runner.poses().shape == (2, 1, 7)

@@ -7,7 +7,6 @@ import pytest
 from tiny_urdf import INERTIAL, joint, link, random_tree, robot, write
 
 import batchpid.task_space as ts
-from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Randomization, Robot, Runner, Uniform
 from batchpid.sim.robot.robot_model import link_tree
 
@@ -80,21 +79,6 @@ def test_payload_acts_at_the_link_that_carries_it(name, tmp_path):
     theirs = motion(loaded, randomization=drawn, wrenches=fixed_links(loaded))
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-4)
     assert np.abs(ours - none).max() > 1e-3
-
-
-def test_poses_of_links_are_watched_by_name(tmp_path):
-    def build(scene, env):
-        return ["camera", "upper", next(each for each in scene.entities if each.name == "lower")]
-
-    poses, loaded = [], load(tmp_path, arm())
-    for links in (None, fixed_links(loaded)):
-        options = {"engine": "sapien", "params": loaded.params(kp=5.0), "wrenches": links}
-        with Runner(loaded, 1, build=build, workers=0, **options) as runner:
-            runner.reset(qpos=np.array([0.3, -0.4]))
-            poses.append(runner.poses()[0])
-    np.testing.assert_allclose(*poses, atol=2e-6)
-    with pytest.raises(InvalidArgumentError, match="names of the robot"):
-        Runner(loaded, 1, build=lambda scene, env: "lens", workers=0, **options)
 
 
 PAIRS = [("arm", "side"), ("tip", "side"), ("arm", "back"), ("tip", "back"), ("side", "back")]

@@ -24,7 +24,6 @@ class DoubleIntegrators:
     """Pack whose joints have unit inertia: q'' = u, by the semi-implicit Euler method."""
 
     steps_natively = False
-    content = np.zeros(0, np.int64)
 
     def __init__(self, spec, size, first_env):
         self.spec, self.size, self.first_env, self.dof = spec, size, first_env, len(spec.joints)

@@ -5,7 +5,7 @@ import pytest
 from arms import gains, load, motion, run
 
 import batchpid as bp
-from batchpid.sim import Randomization, Recorder, RecordingError, Runner, Uniform
+from batchpid.sim import Randomization, RecordingError, Rollout, Runner, Uniform, write_recording
 from batchpid.sim.identification import logs_of_rollout, read_logs
 from batchpid.sim.identification.log import checked
 
@@ -126,7 +126,6 @@ REFUSED = {
 }
 CHANGES = {
     "params": lambda runner: setattr(runner, "params", gains().replace(kp=1.0)),
-    "actuators": lambda runner: setattr(runner, "actuators", bp.make_actuators(2, strength=2)),
     "snapshot": lambda runner: runner.restore(runner.snapshot()),
     "reset": lambda runner: runner.reset(np.full(2, 0.3), mask=[True, False]),
 }
@@ -142,13 +141,12 @@ def test_runs_that_a_fit_cannot_simulate_are_refused(robot, problem):
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_recording_is_refused_or_divided_at_a_change(robot, tmp_path, change):
     """Params have no effect under control "effort", and a reset begins another stretch."""
-    path = tmp_path / "run.h5"
-    runner = Runner(robot, 2, params=gains(), workers=0, engine="mujoco")
-    with runner, Recorder(path, runner):
-        runner.rollout(motion(1.0))
+    with Runner(robot, 2, params=gains(), workers=0, engine="mujoco") as runner:
+        first = runner.rollout(motion(1.0))
         CHANGES[change](runner)
-        rows = len(runner.rollout(motion(1.0)).time)
-        CHANGES[change](runner)
+        second = runner.rollout(motion(1.0))
+    rows = len(second.time)
+    path = write_recording(Rollout.join([first, second]), tmp_path / "run.h5")
     if change == "reset":
         logs = read_logs(robot, [path])
         assert [len(log.time) for log in logs] == [rows, rows, 2 * rows]

@@ -32,17 +32,15 @@ def check(robot, seeds):
     rng = np.random.default_rng(seeds[0])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FaultWarning)
-        with Runner(robot, ENVS, workers=0, substeps=10) as runner:
-            for seed in seeds:
-                runner.actuators = random_actuators(seed, robot.dof)
-                runner.reset()
-                rollout = runner.rollout(
-                    np.clip(rng.normal(0, 1, (4, ENVS, robot.dof)), robot.lower, robot.upper)
-                )
-                for rows in (rollout.qpos, rollout.qvel, rollout.effort):
-                    assert np.isfinite(rows[rollout.ok]).all(), seed
-                if (limit := runner.actuators.effort_limit) is not None:
-                    assert (np.abs(rollout.effort) <= np.float32(limit) * (1 + 1e-6)).all(), seed
+        for seed in seeds:
+            actuators = random_actuators(seed, robot.dof)
+            setpoints = rng.normal(0, 1, (4, ENVS, robot.dof)).clip(robot.lower, robot.upper)
+            with Runner(robot, ENVS, workers=0, substeps=10, actuators=actuators) as runner:
+                rollout = runner.rollout(setpoints)
+            for rows in (rollout.qpos, rollout.qvel, rollout.effort):
+                assert np.isfinite(rows[rollout.ok]).all(), seed
+            if (limit := actuators.effort_limit) is not None:
+                assert (np.abs(rollout.effort) <= np.float32(limit) * (1 + 1e-6)).all(), seed
 
 
 def test_30_random_settings(panda):

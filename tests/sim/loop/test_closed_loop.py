@@ -110,10 +110,12 @@ def test_gradients_to_gains_motors_and_masses_are_differences(x64):
 
     def loss(scales):
         gain, strength, mass = scales
+        bodies = loop.plant.bodies
+        bodies = bodies._replace(mass=mass * bodies.mass, tensor=mass * bodies.tensor)
         changed = loop.changed(
             params=loop.control.params._replace(kp=gain * loop.control.params.kp),
             actuators=actuators._replace(strength=strength * actuators.strength),
-            plant=loop.plant.with_masses(mass * np.ones(2)),
+            plant=replace(loop.plant, bodies=bodies),
         )
         _, seen = changed.step(changed.init(start), start + 0.3, substeps=60)
         return (seen.qpos - start - 0.3).var() + (seen.qvel**2).mean()
@@ -149,7 +151,6 @@ def test_a_plant_of_the_users_own():
     assert not any(rows.any() for rows in loop.reset(state, np.zeros(2)).plant.values())
     with pytest.raises(InvalidArgumentError, match=r"^mask: is int64"):
         loop.reset(state, np.zeros(2), mask=np.arange(2))
-    assert repr(loop) == "ClosedLoop(Masses, 2 envs, 2 joints, timestep=0.0005)"
 
 
 @pytest.mark.parametrize(

@@ -99,7 +99,7 @@ def test_a_fault_names_the_controller_whose_effort_is_nan(panda, how):
     setpoint = np.zeros((N, panda.dof))
     setpoint[3, 4] = setpoint[3, 6] = 1.0
     message = (
-        r"env 3, joint 'panda_joint5': the effort that its controller returned is not finite, at"
+        r"env 3, 'panda_joint5': the effort that its controller returned is not finite, at"
         r" step"
     )
     with Runner(panda, N, **options) as runner:
@@ -107,10 +107,8 @@ def test_a_fault_names_the_controller_whose_effort_is_nan(panda, how):
             runner.step(setpoint)
         assert runner.backend.startswith("law in JAX") == ("jax" in str(options.get("backend")))
         (fault,) = runner.faults
-        snapshot = runner.snapshot()
     assert fault[:2] == (3, 7 + delay)
     assert (fault.joint, fault.cause) == ("panda_joint5", "effort")
-    assert snapshot.rows["containment/cause"][3] == 7  # files hold the numbers of causes
 
 
 def test_efforts_are_limited(panda):

@@ -10,7 +10,6 @@ import pytest
 from identical import assert_identical
 from robots import load_bundled
 
-from batchpid.errors import InvalidArgumentError
 from batchpid.sim import FaultWarning, Runner
 
 PANDA = load_bundled("panda")
@@ -128,22 +127,6 @@ def test_on_fault_reset_restarts_the_env_and_flags_one_tick():
     assert rollout.ok[:, 2].tolist() == [tick != 4 for tick in range(10)]
     assert np.abs(rollout.qpos[4, 2] - home).max() < 0.02
     assert np.abs(rollout.qpos[9, 2] - home).max() > 0.02
-
-
-@pytest.mark.usefixtures("engine")
-def test_a_start_pose_that_is_not_finite_is_replaced_by_the_last_start():
-    qpos = np.tile(PANDA.start, (N, 1))
-    qpos[3, 2] = np.nan
-    with make() as runner:
-        with pytest.warns(FaultWarning, match=r"env 3, joint 'panda_joint3': its qpos"):
-            obs = runner.reset(qpos=qpos)
-        assert obs.ok.tolist() == [env != 3 for env in range(N)]
-        assert np.isfinite(obs.qpos).all()
-    with (
-        make(on_invalid_input="raise") as runner,
-        pytest.raises(InvalidArgumentError, match=r"qpos.*env 3"),
-    ):
-        runner.reset(qpos=qpos)
 
 
 CAUSES = ("setpoint", "setpoint_rate", "feedforward", "state")

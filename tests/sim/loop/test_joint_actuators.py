@@ -1,4 +1,4 @@
-"""Actuators in the loop: changed in flight, delivered and compensated as the models say."""
+"""Actuators in the loop: delivered and compensated as the models say."""
 
 import dataclasses
 import json
@@ -6,7 +6,6 @@ import json
 import numpy as np
 import pytest
 from identical import assert_identical
-from option_values import FRICTION, SIGNALS
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
@@ -18,18 +17,6 @@ N = 5
 def commands(robot, ticks, seed=0):
     noise = np.random.default_rng(seed).uniform(-0.3, 0.3, (ticks, N, robot.dof))
     return np.clip(robot.settings.target + noise, robot.lower, robot.upper)
-
-
-def test_actuators_that_are_off_again_change_no_bit(panda):
-    table = commands(panda, 5)
-    with Runner(panda, N, workers=0) as runner:
-        ideal = runner.rollout(table)
-        runner.actuators = bp.make_actuators(panda.dof, **SIGNALS, **FRICTION)
-        runner.reset()
-        assert not np.array_equal(ideal.qpos, runner.rollout(table).qpos)
-        runner.actuators = None
-        runner.reset()
-        assert_identical(ideal.observation, runner.rollout(table).observation)
 
 
 def test_the_effort_is_that_delivered(panda):

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from thermal import Thermal
 
-import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Runner
 from batchpid.stages import Stage
@@ -62,19 +61,6 @@ def test_jax_without_the_cpu_is_refused(panda, needs_jax, monkeypatch):
     monkeypatch.setenv("JAX_PLATFORMS", "cuda")
     with pytest.raises(InvalidArgumentError, match="JAX_PLATFORMS is 'cuda'; add cpu"):
         Runner(panda, 2, backend="jax", workers=0)
-
-
-def test_a_sensor_that_is_late_in_flight_begins_with_the_present_velocity(panda):
-    """It began with velocity 0, whatever the robot did."""
-    control = Recording()
-    with Runner(panda, 2, control=control, workers=0) as runner:
-        before = runner.step(panda.target).qvel
-        assert np.abs(before).max() > 0.05
-        runner.actuators = bp.make_actuators(panda.dof, sensor_delay=5e-3)
-        control.seen.clear()
-        runner.step(panda.target)
-    for qvel in control.seen[:10]:
-        np.testing.assert_array_equal(qvel.astype(np.float32), before)
 
 
 def test_a_thermal_limit_keeps_motors_at_the_heat_that_they_hold_for_ever(panda):
