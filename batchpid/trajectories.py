@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Float64
-from batchpid.checks import at_least, broadcast, positive, read_array, time_step
+from batchpid.checks import at_least, broadcast, number, read_array, time_step
 from batchpid.errors import InvalidArgumentError
 
 _PEAK_VELOCITY = 15 / 8  # of the minimum-jerk s, times T
@@ -45,19 +45,6 @@ class Trajectory(NamedTuple):
         """Number of ticks."""
         return len(self.time)
 
-    def hold(self, duration: float) -> Trajectory:
-        """Return this trajectory with its last position held for ``duration`` [s], rounded up to
-        whole ticks.
-        """
-        # Times are ticks times dt: sums of times would collect rounding.
-        dt = self.time[0]
-        ticks = _count(positive("duration", duration, "s"), dt)
-        time = dt * np.arange(1, self.ticks + ticks + 1)
-        still = np.repeat(self.position[-1:], ticks, axis=0)
-        rest = np.zeros_like(still)
-        parts = zip(self[1:], (still, rest, rest), strict=True)
-        return Trajectory(time, *map(np.concatenate, parts))
-
 
 def minimum_jerk(
     start: ArrayLike,
@@ -67,6 +54,7 @@ def minimum_jerk(
     duration: ArrayLike | None = None,
     max_velocity: ArrayLike | None = None,
     max_acceleration: ArrayLike | None = None,
+    hold: float = 0.0,
 ) -> Trajectory:
     """Return the move of least jerk from rest at ``start`` to rest at ``target``.
 
@@ -83,6 +71,8 @@ def minimum_jerk(
         Instead of ``duration``: limits > 0 of every joint, (joints,) or (envs, joints). Each env
         takes the shortest T that respects them on all of its joints; an infinite limit does not
         apply, but each joint needs one that does.
+    hold
+        Time for which the target is held after the longest of the moves [s].
 
     Raises
     ------
@@ -113,7 +103,9 @@ def minimum_jerk(
             _PEAK_VELOCITY * distance / v, np.sqrt(_PEAK_ACCELERATION * distance / a)
         )
         total = np.broadcast_to(needed.max(-1, keepdims=True), move.shape)
-    count = _count(float(total.max()), time_step("dt", dt))
+    # Whole ticks, without a last one that is due to rounding alone.
+    end = float(total.max()) + number("hold", hold, 0.0, math.inf, "s")
+    count = max(1, math.ceil(end / time_step("dt", dt) * (1 - _ROUNDING)))
     time = dt * np.arange(1.0, count + 1)
     safe = np.maximum(total, dt)  # a move within one tick is done at its end
     tau = np.minimum(time.reshape(-1, *[1] * move.ndim) / safe, 1.0)
@@ -132,20 +124,16 @@ def minimum_jerk(
 
 def _move(start: ArrayLike, target: ArrayLike) -> tuple[Float64, Float64]:
     """Return the start and the move (..., joints) of a move."""
-    shapes = [
-        read_array(name, value).shape for name, value in (("start", start), ("target", target))
-    ]
-    try:
-        shape = np.broadcast_shapes(*shapes)
-    except ValueError:
-        shape = ()
+    x0, x1 = read_array("start", start), read_array("target", target)
+    # Either may be one row for all envs.
+    shape = max(x0.shape, x1.shape, key=lambda shape: (len(shape), shape))
     if not 1 <= len(shape) <= 2 or 0 in shape:
-        problem = f"has shape {shapes[1]} and start {shapes[0]}"
+        problem = f"has shape {x1.shape}, and start {x0.shape}"
         remedy = "give each as (joints,) or (envs, joints), with the same joints"
         raise InvalidArgumentError("target", problem, remedy=remedy)
     x0, x1 = (
-        at_least(n, broadcast(n, x, shape), -math.inf)
-        for n, x in (("start", start), ("target", target))
+        at_least(name, broadcast(name, x, shape), -math.inf)
+        for name, x in (("start", x0), ("target", x1))
     )
     return x0, x1 - x0
 
@@ -154,8 +142,3 @@ def _limit(name: str, value: ArrayLike, move: Float64) -> Float64:
     """Return ``value`` > 0, shaped as ``move``; limits may be infinite."""
     rows = broadcast(name, value, move.shape)
     return at_least(name, rows, 0.0, above=True, infinite=name != "duration")
-
-
-def _count(duration: float, dt: float) -> int:
-    """Return how many ticks cover a duration, without a last tick that is due to rounding alone."""
-    return max(1, math.ceil(duration / dt * (1 - _ROUNDING)))

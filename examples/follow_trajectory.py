@@ -18,13 +18,11 @@ DT = 0.01  # a tick: 20 sim steps [s]
 def profiles(start, target, velocity) -> dict[str, Trajectory]:
     """Return the same move at two speeds and as a step, held at the end for 1 s or longer."""
     moves = {
-        name: minimum_jerk(start, target, DT, max_velocity=share * velocity)
-        for name, share in (("minimum jerk", 1.0), ("half as fast", 0.5))
+        name: minimum_jerk(start, target, DT, max_velocity=share * velocity, hold=hold)
+        for name, share, hold in (("minimum jerk", 1.0, 3.0), ("half as fast", 0.5, 1.0))
     }
-    last = max(move.time[-1] for move in moves.values())
-    still = np.broadcast_to(target, (1, len(target)))
-    moves["step"] = Trajectory(np.array([DT]), still, 0 * still, 0 * still)
-    return {name: move.hold(last + 1.0 - move.time[-1]) for name, move in moves.items()}
+    moves["step"] = minimum_jerk(target, target, DT, duration=DT, hold=5.0)
+    return moves
 
 
 def main():

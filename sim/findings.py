@@ -36,8 +36,7 @@ OF_FILES = (
          "the first `<robot>`; a default namespace (`xmlns=`) is ignored. `${...}` or `$(...)` in an attribute is an"
          " error: the file was never expanded"),
     FindingKind("unknown-element", "note",
-         "elements and attributes that no URDF has, or that have no effect here; in an MJCF file sites, sensors,"
-         " cameras, sleep, and keyframes other than \"home\"",
+         "elements and attributes that no URDF has, or that have no effect here",
          "without them"),
     FindingKind("repeated", "warning",
          "names used twice or missing; several `<limit>`, `<origin>`, `<inertial>`, ... of one element, or shapes of"

@@ -15,15 +15,13 @@ from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.records import summary
 from batchpid.arrays.trees import digest
 from batchpid.checks import array, choice, flag, instance, names
-from batchpid.errors import InvalidArgumentError, warn
+from batchpid.errors import InvalidArgumentError
 from batchpid.motors.friction import LOOKAHEAD, compensation
-from batchpid.sim.diagnosis.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import FRICTION_BAND, known_joints
 from batchpid.sim.signals import POSE_UNITS, TWIST_UNITS, WRENCH_UNITS, CommandSpec
 from batchpid.task_space.frames import moved, pose_error
 from batchpid.task_space.native_rows import BoundOSC
-from batchpid.task_space.osc_params import AXES
 from batchpid.task_space.symmetric import gram, solve
 
 ACCELERATION_UNITS = {
@@ -328,25 +326,6 @@ class OperationalSpace:
         other._timestep = timestep
         other._friction = self._known_friction if "friction" in compensate.split("+") else None
         return other
-
-    def check_stability(self) -> None:
-        """Warn if explicit gains are unstable at the time step: kp dt^2 + 2 kd dt > 4."""
-        k, dt = self._k, self._timestep
-        # The coefficients of implicit gains are below the bound at any time step.
-        for name, kp, kd, columns in (
-            ("stiffness", k.kp, k.kd, AXES),
-            ("posture_stiffness", k.posture_kp, k.posture_kd, self.tree.joint_names),
-        ):
-            ratio = (kp * dt * dt + 2 * kd * dt)[0] / 4
-            worst = int(ratio.argmax())
-            if ratio[worst] > 1:
-                warn(
-                    f"{name}, {columns[worst]!r}: {kp[0, worst]:g} with damping {kd[0, worst]:g} is"
-                    f" {ratio[worst]:.3g} times the stability bound of the sampled loop at a time"
-                    f" step of {dt:g} s; lower it, use a smaller timestep, or"
-                    " discretization='implicit'",
-                    StabilityWarning,
-                )
 
     def tool_pose(self, qpos: Array) -> NDArray[np.float32]:
         """Return the poses of the tool (..., 7) at ``qpos`` (..., dof), as they are observed."""

@@ -31,7 +31,7 @@ from batchpid.arrays.array_types import CHOICES, Array
 from batchpid.arrays.elementwise import TURN
 from batchpid.arrays.field_tables import Field
 from batchpid.arrays.records import LeafBuilder, array_summary, with_fields
-from batchpid.checks import AxisKind, choice, instance, read_array, time_step
+from batchpid.checks import AxisKind, choice, entries, instance, read_array, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space.rigid_tree import MAKE_TREE, RigidTree
 from batchpid.task_space.tree_kinematics import check_masses
@@ -151,7 +151,8 @@ def make_osc_params(
     Raises
     ------
     InvalidArgumentError
-        Naming the option, axis or joint, env and value.
+        Naming the option, axis or joint, env and value; also where a gain is unstable at the time
+        step: kp* dt^2 + 2 kd* dt > 4.
     """
     check_masses(instance("tree", tree, RigidTree, MAKE_TREE))
     dt = time_step("dt", dt)
@@ -168,15 +169,25 @@ def make_osc_params(
         rows[name] = build.array(name, options.get(name, field.default), field)
         envs = build.num_envs
 
-    def at_step(kp: Array, kd: Array) -> tuple[Array, Array, Array]:
-        # kp*, kd* and g* of a law without integral
+    def at_step(name: str, kp: Array, kd: Array) -> tuple[Array, Array, Array]:
+        # kp*, kd* and g* of a law without integral, below the stability bound of the sampled loop
         share = 1 / (1 + ahead * kd + ahead * ahead * kp)
-        return kp * share, (kd + ahead * kp) * share, share
+        stiffness, damping = kp * share, (kd + ahead * kp) * share
+        entries(
+            name,
+            kp,
+            stiffness * dt * dt + 2 * damping * dt <= 4,
+            f"is unstable at a time step of {dt:g} s",
+            columns[OSC_FIELDS[name].group],
+            kind="entry" if name == "stiffness" else "joint",
+            remedy="lower it, use a smaller time step, or discretization='implicit'",
+        )
+        return stiffness, damping, share
 
     kp = rows.pop("stiffness")
     kd = 2 * rows.pop("damping_ratio") * np.sqrt(kp)
     ki = rows.pop("integral_gain")
-    rows["kp"], rows["kd"], share = at_step(kp + ahead * ki, kd)
+    rows["kp"], rows["kd"], share = at_step("stiffness", kp + ahead * ki, kd)
     rows["c"], rows["acceleration_share"] = kd * share, share
     if ki.any():
         rows["ki_dt"] = share * ki * dt
@@ -187,12 +198,12 @@ def make_osc_params(
     # Followers have no posture and no limits of their own: their leader has them.
     leads = tree.coupling.independent
     kp = rows.pop("posture_stiffness") * leads
-    rows["posture_kp"], rows["posture_kd"], _ = at_step(kp, 2 * np.sqrt(kp))
+    rows["posture_kp"], rows["posture_kd"], _ = at_step("posture_stiffness", kp, 2 * np.sqrt(kp))
     lower, upper = np.array([tree.lower]), np.array([tree.upper])
     margin = np.minimum(rows.pop("limit_margin"), (upper - lower) / 4) * leads
     if margin.any():
         kp = LIMIT_STIFFNESS * (margin > 0)
-        rows["limit_kp"], damping, _ = at_step(kp, 2 * np.sqrt(kp))
+        rows["limit_kp"], damping, _ = at_step("limit_margin", kp, 2 * np.sqrt(kp))
         rows["limit_kd"] = damping / np.where(margin > 0, margin, 1.0)
         rows["limit_low"], rows["limit_high"] = lower + margin, upper - margin
     motion = read_array("axes", axes, "b")

@@ -226,13 +226,9 @@ def read_point(like: Array, point: Array) -> Array:
     if point is None:
         return None
     xp = namespace(like, point)
-    if xp is np:
-        at = read_array("point", point).astype(np.float64, copy=False)
-    else:
-        at = xp.asarray(point, like.dtype)
-    shapes = dict.fromkeys([(3,), (*like.shape[:-1], 3)])
-    if at.shape not in shapes:
-        problem = f"has shape {at.shape}, not {' or '.join(map(str, shapes))}"
+    at = xp.asarray(read_array("point", point, traced=True), like.dtype)
+    if at.shape not in ((3,), (*like.shape[:-1], 3)):
+        problem = f"has shape {at.shape}, not (3,) or {(*like.shape[:-1], 3)}"
         raise InvalidArgumentError("point", problem, remedy="give x, y, z in the link's frame [m]")
     return at
 

@@ -98,7 +98,7 @@ COMMANDS = {
             "picture": Output(
                 "Picture, or film of the first 16 envs,",
                 (*PICTURES, ".mp4", ".gif"),
-                "{recording}-{kind}.png",
+                "{recording}.png",
             )
         },
     ),

@@ -168,19 +168,13 @@ def rollout(
         # A start off the trajectory would count as an error of following.
         start = robot.start if motion.start is None else motion.start
         options["substeps"] = motion.substeps
-        source = "central differences of the rows"
-        if motion.has_rates:
-            source = "from the file"
-        notes.append(f"Rates of the setpoints: {source if rates else 'not given'}.")
         if rates:
             inputs = {
                 "setpoint_rates": motion.rate,
                 "setpoint_accelerations": motion.acceleration,
             }
-        if rates and motion.steps:
-            notes.append(
-                f"{motion.steps} steps of the setpoints exceed the velocity limits; their rate is 0."
-            )
+        else:
+            notes.append("Rates of the setpoints: not given.")
 
     with Runner(robot, num_envs, **options) as runner:
         # The speed is that of the run alone, without the start of processes.

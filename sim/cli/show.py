@@ -12,7 +12,7 @@ from collections import Counter
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -130,7 +130,6 @@ class Recording:
     path: Path
     rollout: Rollout
     robot: Robot | None
-    kind: str
 
     def report(self) -> str:
         """Return a line about the run."""
@@ -140,12 +139,7 @@ class Recording:
         """Draw the run."""
         from batchpid.sim import plots
 
-        draw = {
-            "responses": plots.step_responses,
-            "efforts": plots.efforts,
-            "following": plots.following_errors,
-        }
-        return draw[self.kind](self.rollout)
+        return plots.step_responses(self.rollout)
 
     def film(self, path: Path, progress: Progress[int]) -> None:
         """Film the first :data:`SHOWN_ENVS` envs in real time."""
@@ -162,13 +156,9 @@ def plot(
         flag("File that `batchpid rollout --out` or batchpid.sim.write_recording wrote, .h5."),
     ],
     robot: Robot | None = None,
-    kind: Annotated[
-        Literal["responses", "efforts", "following"],
-        flag("Step responses, efforts against their limits, or errors of following."),
-    ] = "responses",
 ) -> Recording:
     """Draw a recorded run, or film it: the robot of the recording, or the one that is named."""
-    return Recording(recording, read_recording(recording), robot, kind)
+    return Recording(recording, read_recording(recording), robot)
 
 
 def recording_line(path: Path, rollout: Rollout) -> str:

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Document, Float64
 from batchpid.arrays.elementwise import read_only
 from batchpid.motors.coupling import Coupling, Follower
 from batchpid.sim.description.tables import NO_TURN, ORIGIN, Body, Joint, Placement, Tables
@@ -159,12 +159,8 @@ def _merged_joints(joints: Sequence[Joint], separate: Separate) -> set[str]:
     merged = {joint.name for joint in fixed}
     if _moving_order(joints, merged) == order:
         return merged
-    # Else joints without motion below them first, then one by one what keeps the order.
-    merged = {joint.name for joint in fixed if joint.child_link not in carriers}
-    for joint in fixed:
-        if _moving_order(joints, merged | {joint.name}) == order:
-            merged.add(joint.name)
-    return merged
+    # Else the joints without motion below them.
+    return {joint.name for joint in fixed if joint.child_link not in carriers}
 
 
 def _moving_order(joints: Sequence[Joint], merged: Collection[str]) -> list[str]:
@@ -267,6 +263,19 @@ def payload_place(tables: Tables, separate: Separate, carrier: str) -> Placement
     return at._replace(position=inertia.moved(at.position, at.wxyz).center)
 
 
+_COUPLED = (
+    "lower",
+    "soft_lower",
+    "upper",
+    "soft_upper",
+    "velocity_limit",
+    "acceleration_limit",
+    "friction",
+    "damping",
+)
+"""Fields of a joint that :func:`couple` changes."""
+
+
 @lru_cache(maxsize=32)
 def coupling_of(joints: tuple[Joint, ...]) -> Coupling:
     """Return the coupling of the degrees of freedom ``joints``; the identity without mimic
@@ -284,44 +293,40 @@ def coupling_of(joints: tuple[Joint, ...]) -> Coupling:
 def couple(joints: Sequence[Joint]) -> tuple[Joint, ...]:
     """Return ``joints`` with the leaders' limits, friction and damping adapted to their followers.
 
-    A follower's position limits narrow the leader's, unless that would leave no range; the follower
-    then gets the leader's limits, multiplied. Its friction and damping act on the leader as |m| F
-    and m^2 B, which is equivalent in the coupled motion.
+    A follower's position limits and soft limits narrow the leader's, unless that would leave no
+    range; the follower then gets the leader's limits, multiplied. Its limits of velocity and
+    acceleration, divided by |m|, hold for the leader. Its friction and damping act on the leader as
+    |m| F and m^2 B, which is equivalent in the coupled motion.
     """
-    joints = tuple(joints)
-    coupling = coupling_of(joints)
-    lower = np.array([joint.lower for joint in joints])
-    upper = np.array([joint.upper for joint in joints])
-    lower, upper = narrowed(coupling, lower, upper)
+    coupling = coupling_of(tuple(joints))
+
+    def columns(*names: str) -> Float64:
+        return np.array([[getattr(joint, name) for joint in joints] for name in names])
+
+    lower, upper = columns("lower", "soft_lower"), columns("upper", "soft_upper")
+    for follower in coupling.followers.tolist():
+        leader = coupling.leader[follower]
+        ends = np.stack([lower[:, follower], upper[:, follower]]) - coupling.offset[follower]
+        ends = ends / coupling.multiplier[follower]
+        low = np.maximum(lower[:, leader], ends.min(0))
+        high = np.minimum(upper[:, leader], ends.max(0))
+        fits = low < high
+        lower[:, leader] = np.where(fits, low, lower[:, leader])
+        upper[:, leader] = np.where(fits, high, upper[:, leader])
     # Followers get the images of the limits of their leaders.
-    ends = np.stack([lower, upper])[:, coupling.leader] * coupling.multiplier + coupling.offset
+    ends = np.stack([lower, upper])[..., coupling.leader] * coupling.multiplier + coupling.offset
     lower = np.where(coupling.independent, lower, ends.min(0))
     upper = np.where(coupling.independent, upper, ends.max(0))
     share = np.abs(coupling.multiplier)
+    rates = columns("velocity_limit", "acceleration_limit")
+    np.minimum.at(rates.T, coupling.leader, (rates / share).T)
     friction, damping = np.zeros((2, len(joints)))
-    np.add.at(friction, coupling.leader, share * [joint.friction for joint in joints])
-    np.add.at(damping, coupling.leader, share**2 * [joint.damping for joint in joints])
-    columns = lower, upper, friction, damping
-    return tuple(
-        replace(joint, lower=low, upper=high, friction=force, damping=rate)
-        for joint, low, high, force, rate in zip(
-            joints, *(column.tolist() for column in columns), strict=True
-        )
-    )
-
-
-def narrowed(coupling: Coupling, lower: Float64, upper: Float64) -> tuple[Float64, Float64]:
-    """Return position limits (..., joints) with the limits of leaders narrowed by those of their
-    followers, unless that would leave no range.
-    """
-    lower, upper = lower.copy(), upper.copy()
-    for follower in coupling.followers.tolist():
-        leader = coupling.leader[follower]
-        ends = np.stack([lower[..., follower], upper[..., follower]]) - coupling.offset[follower]
-        ends = ends / coupling.multiplier[follower]
-        low = np.maximum(lower[..., leader], ends.min(0))
-        high = np.minimum(upper[..., leader], ends.max(0))
-        fits = low < high
-        lower[..., leader] = np.where(fits, low, lower[..., leader])
-        upper[..., leader] = np.where(fits, high, upper[..., leader])
-    return lower, upper
+    np.add.at(friction, coupling.leader, share * columns("friction")[0])
+    np.add.at(damping, coupling.leader, share**2 * columns("damping")[0])
+    fields = [*lower, *upper, *rates, friction, damping]
+    coupled = []
+    for index, joint in enumerate(joints):
+        numbers = [float(values[index]) for values in fields]
+        changes: Document = dict(zip(_COUPLED, numbers, strict=True))
+        coupled.append(replace(joint, **changes))
+    return tuple(coupled)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -25,7 +25,7 @@ from batchpid.sim.description.mjcf_bodies import (
     excluded_pairs,
     label,
 )
-from batchpid.sim.description.mjcf_motors import read_couplings, read_motors
+from batchpid.sim.description.mjcf_motors import Couplings, read_couplings, read_motors
 from batchpid.sim.description.tables import MjcfFile, Source
 from batchpid.sim.findings import Finding
 from batchpid.task_space.rigid_tree import GRAVITY
@@ -60,6 +60,16 @@ _SWITCHES = (
     "CONSTRAINT",
 )
 """Parts of MuJoCo's physics that a file can disable."""
+_OF_TENDONS = (
+    "stiffness",
+    "stiffnesspoly",
+    "damping",
+    "dampingpoly",
+    "frictionloss",
+    "armature",
+    "limited",
+)
+"""Effects of a tendon by itself."""
 
 # Without a handler MuJoCo appends warnings to a file in the working folder, too.
 if mujoco.get_mju_user_warning() is None:
@@ -81,30 +91,16 @@ def read_mjcf(
     # MuJoCo opens the file by its path, and workers do so again.
     if not path.is_file():
         raise RobotError(f"{path}: an MJCF file is read several times; save it as a file first")
-    try:
-        return _read(path, name, findings, fixed_base)
-    except UnicodeDecodeError as error:
-        raise RobotError(
-            f"{path}: a name is not UTF-8, which MuJoCo requires: {error}; save it as UTF-8"
-        ) from error
-
-
-def _read(
-    path: Path,
-    name: str,
-    findings: list[Finding],
-    fixed_base: bool | None,
-) -> Source:
     compiled = compile_scene(path)
     model = compiled.model
     robot = RobotInFile(model, path, findings)
     # A base is free where the file has a free joint, unless the caller fixes it.
     if fixed_base is None:
-        fixed_base = not (robot.base and model.body_jntnum[robot.base])
+        fixed_base = not robot.base
     couplings = read_couplings(robot)
     motors = read_motors(robot, couplings)
     tables = robot.read(couplings, motors, is_held=fixed_base)
-    _report_unused(robot)
+    _report_ignored(robot)
     # The start pose is that of the keyframe, else the reference pose.
     key = home(model)
     pose = model.qpos0 if key is None else model.key_qpos[key]
@@ -132,7 +128,7 @@ def _read(
         column(pose[model.jnt_qposadr]),
         # A file of motors alone has no gains to offer.
         gains if (motors.kp + motors.kd).any() else None,
-        mjcf=_file(path, compiled, robot, fixed_base),
+        mjcf=_file(path, compiled, robot, fixed_base, _lost(robot, couplings, len(tables.shapes))),
         disabled=excluded_pairs(model, robot.solid),
         actuators=actuators if actuators is not None and actuators.num_joints else None,
     )
@@ -148,6 +144,7 @@ def _file(
     compiled: Compiled,
     robot: RobotInFile,
     fixed_base: bool,
+    lost: str,
 ) -> MjcfFile:
     """Return the data of the file that the engine MuJoCo needs."""
     model = compiled.model
@@ -163,8 +160,8 @@ def _file(
         if all(robot.is_of_robot(body) for body in at):
             loops.append(label(model.equality(equality)))
     free = model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE].tolist()
-    planes = np.flatnonzero((model.geom_bodyid == 0) & (model.geom_type == PLANE)).tolist()
-    grounds = [plane for plane in planes if can_collide(model, plane)]
+    planes = (model.geom_bodyid == 0) & (model.geom_type == PLANE)
+    grounds = np.flatnonzero(planes & can_collide(model)).tolist()
     floats = any(robot.is_of_robot(body) for body in free)
     return MjcfFile(
         path=str(path),
@@ -172,36 +169,19 @@ def _file(
         bodies=tuple(robot.bodies.values()),
         falling=tuple(robot.bodies[body] for body in free if not robot.is_of_robot(body)),
         loops=tuple(loops),
-        lost="; ".join(
-            f"{kind} ({', '.join(names)})" for kind, names in robot.lost.items() if names
-        ),
+        lost=lost,
         is_alone=all(robot.is_of_robot(body) for body in model.jnt_bodyid),
         has_floor=bool(grounds) and not (floats and fixed_base),
         friction=float(model.geom_friction[grounds[0], 0]) if grounds else 1.0,
     )
 
 
-def _report_unused(robot: RobotInFile) -> None:
-    """Report content that is not simulated, apart from motors, couplings and shapes."""
+def _report_ignored(robot: RobotInFile) -> None:
+    """Report content that no engine simulates, apart from motors."""
     model, option = robot.model, robot.model.opt
-    counts = {
-        "sites": model.nsite,
-        "sensors": model.nsensor,
-        "cameras": model.ncam,
-        "keyframes": model.nkey - (home(model) is not None),
-        "<flag sleep='enable'>": int(option.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP > 0),
-    }
-    unused = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
-    if unused:
-        text = f"elements that the simulation does not use are left out: {unused}"
-        robot.repairs.append(Finding("unknown-element", text, "expect no effect"))
-    disabled = {
-        switch
-        for switch in (*_SWITCHES, "GRAVITY", "ACTUATION")
-        if option.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{switch}")
-    }
-    # What no engine simulates, then what MuJoCo alone does.
-    ignored = [f"<flag {switch.lower()}>" for switch in sorted(disabled.difference(_SWITCHES))]
+    ignored = [
+        f"<flag {name.lower()}>" for name in ("ACTUATION", "GRAVITY") if _is_off(option, name)
+    ]
     if tuple(option.gravity) != GRAVITY:
         ignored.append("gravity")
     ignored += [
@@ -213,19 +193,41 @@ def _report_unused(robot: RobotInFile) -> None:
         text = f"has no effect, gravity is {GRAVITY} m/s^2: {', '.join(ignored)}"
         remedy = "let the controller compensate, or use Randomization(gravity=...)"
         robot.repairs.append(Finding("option", text, remedy))
-    lost = robot.lost
-    lost["<flag>"] += [switch.lower() for switch in _SWITCHES if switch in disabled]
-    if option.density or option.viscosity:
-        lost["the medium"].append("density, viscosity")
-    if model.nflex:
-        lost["flexible bodies"].append("rigid")
-    if (model.body_plugin >= 0).any():
-        lost["plugins"].append("of bodies")
-    for joint, name in robot.joints.items():
-        if model.jnt_stiffness[joint] or model.jnt_stiffnesspoly[joint].any():
-            lost["springs"].append(repr(name))
-        if model.dof_dampingpoly[model.jnt_dofadr[joint]].any():
-            lost["damping that grows with the speed"].append(repr(name))
+
+
+def _is_off(option: Any, name: str) -> bool:
+    return bool(option.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}"))
+
+
+def _lost(robot: RobotInFile, couplings: Couplings, shapes: int) -> str:
+    """Return the content that is missing in an engine which does not simulate the file, apart from
+    the robot's motors, ``couplings`` and ``shapes``.
+    """
+    model, option = robot.model, robot.model.opt
+    joints = list(robot.joints)
+    dofs = model.jnt_dofadr[joints]
+    # A level plane at height 0 is the ground of the engines.
+    poses = np.column_stack([model.geom_pos[:, 2], model.geom_quat[:, 1:3]])
+    of_world = model.geom_bodyid == 0
+    grounds = of_world & (model.geom_type == PLANE) & ~poses.any(1)
+    of_robot = np.array([robot.is_of_robot(body) for body in model.geom_bodyid], bool)
+    solid = can_collide(model) & (of_robot | of_world) & ~grounds
+    counts: dict[str, Any] = {
+        "bodies apart from the robot": len(robot.left_out),
+        "equality constraints": model.eq_active0.sum() - len(couplings),
+        "tendons": sum(
+            any(np.any(getattr(model, f"tendon_{name}")[tendon]) for name in _OF_TENDONS)
+            for tendon in range(model.ntendon)
+        ),
+        "springs": np.c_[model.jnt_stiffness, model.jnt_stiffnesspoly][joints].any(1).sum(),
+        "dampers that are not linear": model.dof_dampingpoly[dofs].any(1).sum(),
+        "planes, height fields and shapes of the world": solid.sum() - shapes,
+        "flexible bodies": model.nflex,
+        "plugins of bodies": (model.body_plugin >= 0).sum(),
+        "properties of a medium": np.count_nonzero([option.density, option.viscosity]),
+        "disabling <flag>s": sum(_is_off(option, name) for name in _SWITCHES),
+    }
+    return ", ".join(f"{kind} ({count})" for kind, count in counts.items() if count)
 
 
 class Compiled(NamedTuple):
@@ -254,7 +256,9 @@ def compile_scene(path: Path) -> Compiled:
     try:
         scene = mujoco.MjSpec.from_file(str(path))
         scene.compiler.discardvisual = True
-        return Compiled(scene, scene.compile())
+        model = scene.compile()
+        model.names.decode()  # MuJoCo requires UTF-8, and does not check it
+        return Compiled(scene, model)
     except (ValueError, mujoco.FatalError) as error:
         problem = " ".join(str(error).split())
         raise RobotError(

@@ -16,7 +16,6 @@ A mesh collides as its convex hull, in MuJoCo and in PhysX, and an ellipsoid as 
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable
 from functools import partial
 from itertools import combinations
@@ -26,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from batchpid.arrays.array_types import Float64, MjModel
+from batchpid.arrays.array_types import Bool, Float64, MjModel
 from batchpid.errors import RobotError
 from batchpid.sim.description.tables import (
     NO_TURN,
@@ -50,6 +49,7 @@ if TYPE_CHECKING:
 
 PLANE = mujoco.mjtGeom.mjGEOM_PLANE
 _FREE, _BALL = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
+_SLIDE, _HINGE = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
 _SHAPE_KINDS: dict[int, tuple[ShapeKind, int]] = {
     mujoco.mjtGeom.mjGEOM_SPHERE: ("sphere", 1),
     mujoco.mjtGeom.mjGEOM_BOX: ("box", 3),
@@ -57,8 +57,8 @@ _SHAPE_KINDS: dict[int, tuple[ShapeKind, int]] = {
     mujoco.mjtGeom.mjGEOM_CYLINDER: ("cylinder", 2),
 }
 """Kind of a shape, and the number of its sizes, by type of a geom."""
-_PARALLELS, _MERIDIANS = 12, 16
-"""Rings, poles included, and vertices of a ring, of an ellipsoid's hull."""
+_POINTS = 160
+"""Vertices of an ellipsoid's hull."""
 
 
 def label(element: Any) -> str:
@@ -66,10 +66,12 @@ def label(element: Any) -> str:
     return repr(element.name or f"number {element.id}")
 
 
-def can_collide(model: MjModel, geom: int) -> bool:
-    """Return whether a geom collides with anything, by its masks or in a ``<pair>``."""
-    paired = geom in model.pair_geom1 or geom in model.pair_geom2
-    return bool(model.geom_contype[geom] | model.geom_conaffinity[geom]) or paired
+def can_collide(model: MjModel) -> Bool:
+    """Return whether each geom (geoms,) collides with anything, by its masks or in a ``<pair>``."""
+    paired = [*model.pair_geom1, *model.pair_geom2]
+    collides: Bool = (model.geom_contype | model.geom_conaffinity) != 0
+    collides[paired] = True
+    return collides
 
 
 class RobotInFile:
@@ -79,8 +81,7 @@ class RobotInFile:
     is the body of the root, 0 for the world; ``link_names`` and ``joint_names`` are all names in
     use. ``moments`` are the moment arms of the outputs of actuators on the degrees of freedom, at
     the reference pose. ``repairs`` are findings of what is simulated otherwise than the file says.
-    ``lost`` has the names of contents, by kind, that are simulated only by an engine that reads the
-    file itself. After :meth:`read` ``solid`` is the name of the row of each body that has shapes, by
+    After :meth:`read` ``solid`` is the name of the row of each body that has shapes, by
     the body's number.
 
     Raises RobotError for a ball joint, and for several robots.
@@ -89,7 +90,6 @@ class RobotInFile:
     def __init__(self, model: MjModel, path: Path, repairs: list[Finding]) -> None:
         self.model = model
         self.repairs = repairs
-        self.lost: dict[str, list[str]] = defaultdict(list)
         names = [model.body(body).name for body in range(1, model.nbody)]
         self.link_names = {"world", *names}
         self.joint_names = {model.joint(joint).name for joint in range(model.njnt)}
@@ -102,67 +102,59 @@ class RobotInFile:
         self.moments = np.zeros((len(data.moment_rownnz), model.nv))
         sparse = data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
         mujoco.mju_sparse2dense(self.moments, *sparse)
-        self._left_out: set[int] = set()
-        joints = {
-            joint: model.joint(joint).name or unique(f"joint{joint}", self.joint_names)
-            for joint in range(model.njnt)
-            if int(model.jnt_type[joint]) not in (_FREE, _BALL)
-        }
+        self.left_out: set[int] = set()
         self._anchors = {0: ORIGIN}  # origin of each body's row, in the frame of the body
         self._bodies: list[Body] = []
         self._shapes: list[Shape] = []
         self.solid: dict[int, str] = {}
-        self.base = self._find_base(joints, path)
-        self.joints = {
-            joint: name
-            for joint, name in joints.items()
-            if self.is_of_robot(model.jnt_bodyid[joint])
-        }
+        self.base = self._find_base(path)
+        self.joints = {}
+        for joint in np.flatnonzero(np.isin(model.jnt_type, [_SLIDE, _HINGE])).tolist():
+            name = model.joint(joint).name or unique(f"joint{joint}", self.joint_names)
+            if self.is_of_robot(model.jnt_bodyid[joint]):
+                self.joints[joint] = name
 
     def is_of_robot(self, body: int) -> bool:
         """Return whether a body, or the world, is of the robot."""
-        return int(self._roots[body]) not in self._left_out
+        return int(self._roots[body]) not in self.left_out
 
-    def _find_base(self, joints: dict[int, str], path: Path) -> int:
-        """Return the base, after the bodies that are not of the robot are left out."""
+    def _find_base(self, path: Path) -> int:
+        """Return the base, after the bodies that are not of the robot are left out.
+
+        The robot is the object on a free joint that has joints of its own, where actuators move
+        it or move nothing that has joints; else all objects that are not on a free joint.
+        """
         model = self.model
-        # Every child of the world is the root of an object; some of them are the robot.
+        # Every child of the world is the root of an object.
         tops = {body for body in range(1, model.nbody) if model.body_parentid[body] == 0}
-        roots = model.body_rootid[model.jnt_bodyid]
-        free = {int(root) for root in roots[model.jnt_type == _FREE]}
-        balls = {int(root) for root in roots[model.jnt_type == _BALL]}
-        moving = {int(roots[joint]) for joint in joints}
+        roots = model.body_rootid
+        free, balls, moving = (
+            set(roots[model.jnt_bodyid[np.isin(model.jnt_type, kinds)]].tolist())
+            for kinds in ([_FREE], [_BALL], [_SLIDE, _HINGE])
+        )
         # A flexible body has three slides for each vertex.
         soft = {int(body) for body in model.flex_vertbodyid if not model.body_geomnum[body]} & tops
         moving -= soft
-        # Actuators move the children of the world, themselves or bodies below them.
-        driven = moving & set(model.body_rootid[model.dof_bodyid[self.moments.any(0)]].tolist())
-        if driven:
-            moving -= (moving & free) - driven
-        floating = moving & free
+        driven = moving & set(roots[model.dof_bodyid[self.moments.any(0)]].tolist())
+        floating = moving & free & (driven or moving)
         if len(floating) > 1 or (floating and moving - free):
-            listed = ", ".join(repr(self.bodies[body]) for body in sorted(moving))
+            listed = ", ".join(repr(self.bodies[body]) for body in sorted(floating | moving - free))
             raise RobotError(
                 f"{path}: holds several robots, {listed}; leave one of them in the file"
             )
-        mocaps = {body for body in tops if model.body_mocapid[body] >= 0}
-        self._left_out = mocaps | soft | (free - moving)
-        if moving:
-            self._left_out |= balls - moving
         # A robot on a free joint is one object; all others are scenery.
         if floating:
-            self._left_out |= tops - floating
+            self.left_out = tops - floating
+        else:
+            mocaps = {body for body in tops if model.body_mocapid[body] >= 0}
+            self.left_out = mocaps | soft | free | (balls - moving)
         for joint in np.flatnonzero(model.jnt_type == _BALL).tolist():
             body = int(model.jnt_bodyid[joint])
             if self.is_of_robot(body):
                 where = f"{path}: body {self.bodies[body]!r}"
                 problem = f"the ball joint {label(model.joint(joint))} has no single position"
                 raise RobotError(f"{where}: {problem} to control; replace it by three hinges")
-        apart = sorted(self._left_out - soft)
-        self.lost["bodies apart from the robot"] += [repr(self.bodies[body]) for body in apart]
-        if floating:
-            return floating.pop()
-        return 0
+        return floating.pop() if floating else 0
 
     def read(self, couplings: Couplings, motors: JointMotors, is_held: bool) -> Tables:
         """Return the tables; ``is_held`` says whether a base on a free joint is fixed."""
@@ -183,7 +175,6 @@ class RobotInFile:
             elif above in rows and self.is_of_robot(body):
                 self._read_body(body, self.bodies[above], read_joint)
                 rows.add(body)
-        self._report_absent(rows)
         return breadth_first(self._bodies, self._shapes)
 
     def _read_body(
@@ -205,7 +196,7 @@ class RobotInFile:
         for number in joints:
             axis = model.jnt_axis[number]
             rest = model.qpos0[model.jnt_qposadr[number]]
-            if model.jnt_type[number] == mujoco.mjtJoint.mjJNT_SLIDE:
+            if model.jnt_type[number] == _SLIDE:
                 anchor = ORIGIN
                 place = place - rest * rotate(matrix_of(turn), axis)
             else:
@@ -238,7 +229,7 @@ class RobotInFile:
         lower, upper = -np.inf, np.inf
         if model.jnt_limited[number]:
             lower, upper = model.jnt_range[number].tolist()
-        if model.jnt_type[number] == mujoco.mjtJoint.mjJNT_SLIDE:
+        if model.jnt_type[number] == _SLIDE:
             kind = "prismatic"
         elif model.jnt_limited[number]:
             kind = "revolute"
@@ -275,7 +266,7 @@ class RobotInFile:
         """Add a row with inertia and shapes of a body, in a frame with its origin at ``anchor``."""
         model = self.model
         self._anchors[body] = anchor
-        for geom in self._geoms(body):
+        for geom in np.flatnonzero(can_collide(model) & (model.geom_bodyid == body)).tolist():
             if (shape := self._read_shape(geom, row.name, anchor)) is not None:
                 self._shapes.append(shape)
                 self.solid[body] = row.name
@@ -289,12 +280,6 @@ class RobotInFile:
             turn = model.body_iquat[body].copy()
             row = with_mass(row, mass, center, inertia, turn, self.repairs)
         self._bodies.append(row)
-
-    def _geoms(self, body: int) -> list[int]:
-        """Return the geoms of a body that can collide."""
-        first = int(self.model.body_geomadr[body])
-        geoms = range(first, first + int(self.model.body_geomnum[body]))
-        return [geom for geom in geoms if can_collide(self.model, geom)]
 
     def _read_shape(self, geom: int, link: str, anchor: Float64) -> Shape | None:
         """Return the shape of a geom of ``link``, None for a plane or a height field."""
@@ -329,21 +314,6 @@ class RobotInFile:
             vertices=vertices,
         )
 
-    def _report_absent(self, rows: set[int]) -> None:
-        """Report the shapes of the robot and of the world that are no shapes of the tables. A level
-        plane at height 0 is the ground of the engines.
-        """
-        model = self.model
-        absent = self.lost["planes, height fields and shapes of the world"]
-        for geom in [geom for body in sorted({0, *rows}) for geom in self._geoms(body)]:
-            body = int(model.geom_bodyid[geom])
-            kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
-            pose = [*model.geom_pos[geom, 2:], *model.geom_quat[geom, 1:3]]
-            is_ground = body == 0 and kind == "plane" and not any(pose)
-            is_solid = body in self.solid and kind not in ("plane", "hfield")
-            if not is_ground and not is_solid:
-                absent.append(f"{kind} {label(model.geom(geom))}")
-
 
 def excluded_pairs(model: MjModel, solid: dict[int, str]) -> tuple[DisabledPair, ...]:
     """Return the pairs of rows with shapes that never collide: excluded, or by the masks of all
@@ -358,26 +328,15 @@ def excluded_pairs(model: MjModel, solid: dict[int, str]) -> tuple[DisabledPair,
         frozenset(model.geom_bodyid[[one, other]].tolist())
         for one, other in zip(model.pair_geom1, model.pair_geom2, strict=True)
     }
-    # A body's geoms touch another's if a bit of the one's types is in the other's affinities.
-    masks: dict[int, list[tuple[int, int]]] = defaultdict(list)
-    for geom, body in enumerate(model.geom_bodyid.tolist()):
-        masks[body].append((int(model.geom_contype[geom]), int(model.geom_conaffinity[geom])))
-
-    def collide(first: int, second: int) -> bool:
+    types, affinities = model.body_contype, model.body_conaffinity
+    pairs = []
+    for first, second in combinations(solid, 2):
         pair = frozenset((first, second))
-        if pair in paired or pair in excluded:
-            return pair in paired
-        return any(
-            types & other_affinities or other_types & affinities
-            for types, affinities in masks[first]
-            for other_types, other_affinities in masks[second]
-        )
-
-    return tuple(
-        DisabledPair(solid[first], solid[second], "User")
-        for first, second in combinations(solid, 2)
-        if model.body_weldid[first] != model.body_weldid[second] and not collide(first, second)
-    )
+        meet = types[first] & affinities[second] | types[second] & affinities[first]
+        is_apart = model.body_weldid[first] != model.body_weldid[second]
+        if is_apart and pair not in paired and (pair in excluded or not meet):
+            pairs.append(DisabledPair(solid[first], solid[second], "User"))
+    return tuple(pairs)
 
 
 def _hull(model: MjModel, mesh: int) -> Float64:
@@ -391,10 +350,10 @@ def _hull(model: MjModel, mesh: int) -> Float64:
 
 
 def _ellipsoid(radii: Float64) -> Float64:
-    """Return vertices (n, 3) of a polyhedron with its vertices on an ellipsoid."""
-    polar = np.linspace(0, np.pi, _PARALLELS)[1:-1, None]
-    angle = np.arange(_MERIDIANS) * 2 * np.pi / _MERIDIANS
-    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(_MERIDIANS)], -1)
-    pole = np.array([0.0, 0.0, 1.0])
-    rings = np.sin(polar)[..., None] * ring + np.cos(polar)[..., None] * pole
-    return np.concatenate([rings.reshape(-1, 3), [pole, -pole]]) * radii
+    """Return points (n, 3) on an ellipsoid, along a spiral from pole to pole (E. B. Saff and A. B.
+    J. Kuijlaars, "Distributing many points on a sphere", Math. Intelligencer 19, 1997).
+    """
+    height = np.linspace(-1, 1, _POINTS)
+    angle = np.arange(_POINTS) * np.pi * (3 - np.sqrt(5))
+    radius = np.sqrt(1 - height**2)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], -1) * radii

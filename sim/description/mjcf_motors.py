@@ -28,16 +28,6 @@ _TRN, _EQ = mujoco.mjtTrn, mujoco.mjtEq
 _GAIN, _BIAS, _DYN = mujoco.mjtGain, mujoco.mjtBias, mujoco.mjtDyn
 _FILTERS = (_DYN.mjDYN_NONE, _DYN.mjDYN_FILTER, _DYN.mjDYN_FILTEREXACT)
 """Dynamics whose state follows the control, so that the control's range limits the force."""
-_OF_TENDONS = (
-    "stiffness",
-    "stiffnesspoly",
-    "damping",
-    "dampingpoly",
-    "frictionloss",
-    "armature",
-    "limited",
-)
-"""Effects of a tendon by itself."""
 
 
 class JointMotors(NamedTuple):
@@ -66,13 +56,10 @@ def read_couplings(robot: RobotInFile) -> Couplings:
         follower = int(model.eq_obj1id[equality])
         leader = int(model.eq_obj2id[equality])
         if model.eq_type[equality] != _EQ.mjEQ_JOINT or follower not in robot.joints:
-            robot.lost["equality constraints"].append(label(model.equality(equality)))
             continue
         offset, multiplier, *higher = model.eq_data[equality, :5].tolist()
         is_linear = leader in robot.joints and multiplier and not any(higher)
         if not is_linear or follower in couplings:
-            name = repr(robot.joints[follower])
-            robot.lost["equalities that are not linear in one other joint"].append(name)
             continue
         rest, rest_of_leader = model.qpos0[model.jnt_qposadr[[follower, leader]]].tolist()
         offset += rest - multiplier * rest_of_leader
@@ -135,11 +122,6 @@ def read_motors(robot: RobotInFile, couplings: Couplings) -> JointMotors:
         if model.jnt_actfrclimited[joint]:
             narrower = _magnitude(model.jnt_actfrcrange[joint], name, findings)
             limits[joint] = min(limits[joint], narrower)
-    robot.lost["effects of tendons"] += [
-        label(model.tendon(tendon))
-        for tendon in range(model.ntendon)
-        if any(np.any(getattr(model, f"tendon_{effect}")[tendon]) for effect in _OF_TENDONS)
-    ]
     return JointMotors(
         limits,
         armature,

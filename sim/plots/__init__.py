@@ -2,20 +2,14 @@
 
 from batchpid.sim.plots.figures import (
     FORMATS,
-    comparison,
-    efforts,
     fit_errors,
-    following_errors,
     save,
     step_responses,
 )
 
 __all__ = [
     "FORMATS",
-    "comparison",
-    "efforts",
     "fit_errors",
-    "following_errors",
     "save",
     "step_responses",
 ]

@@ -1,5 +1,4 @@
-"""Figures of runs: step responses, efforts against their limits, errors of following, two runs
-compared, and errors of an identification.
+"""Figures of runs: responses of one run or of two, and errors of an identification.
 
 Everything is drawn by Matplotlib's object interface on the Agg and SVG canvases: no display, no
 global state. Every artist with a meaning has a label, from which the legend is made.
@@ -52,13 +51,13 @@ class Picture(Figure):
 
 
 def step_responses(
-    rollout: Rollout,
-    *,
+    *rollouts: Rollout,
+    labels: Sequence[str] = (),
     joints: Sequence[str] = (),
     title: str = "",
 ) -> Figure:
     """Draw, for each joint, positions against setpoint and limits above efforts against their
-    limit.
+    limit; two runs of the same joints over each other, with the setpoints and limits of the first.
 
     Setpoints that are not one number for each joint have separate axes, one for each entry of the
     command, with the pose of the tool where there is one. Not-finite samples are gaps; so is
@@ -66,81 +65,36 @@ def step_responses(
 
     Parameters
     ----------
+    labels
+        Names of two runs.
     joints
         Names; default all.
 
     Raises
     ------
     InvalidArgumentError
-        The robot has no such joint.
+        The robot has no such joint, or the runs have different joints.
     """
-    return _responses([rollout], [""], joints, title)
-
-
-def efforts(rollout: Rollout) -> Figure:
-    """Draw, for each joint, efforts against their limit."""
-    run = _blank_failed(rollout)
-    figure, chosen, blocks = _joint_axes([run], (), 1)
-    for joint, (axes,) in zip(chosen, blocks, strict=True):
-        _draw_efforts(axes, [run], [""], joint)
-    _add_legend(figure)
-    return figure
-
-
-def following_errors(rollout: Rollout) -> Figure:
-    """Draw, for each joint, position minus setpoint at the ends of the ticks, where a setpoint
-    holds.
-    """
-    run = _blank_failed(rollout)
-    figure, chosen, blocks = _joint_axes([run], (), 1)
-    for joint, (axes,) in zip(chosen, blocks, strict=True):
-        error = run.qpos[..., joint] - run.setpoint[..., joint]
-        _draw_fan(axes, run.time, error)
-        _show(axes, error, run.info.units[joint])
-    _add_legend(figure)
-    return figure
-
-
-def comparison(
-    first: Rollout,
-    second: Rollout,
-    *,
-    labels: tuple[str, str] = ("first", "second"),
-    title: str = "",
-) -> Figure:
-    """Draw two runs of the same joints as :func:`step_responses`, over each other.
-
-    Raises
-    ------
-    InvalidArgumentError
-        The runs have different joints.
-    """
-    info = first.info
-    if info.joint_names != second.info.joint_names:
-        problem = f"has the joints {', '.join(second.info.joint_names)}"
-        remedy = f"compare runs with the joints {', '.join(info.joint_names)}"
-        raise InvalidArgumentError("second", problem, remedy=remedy)
-    return _responses([first, second], [f"{label}: " for label in labels], (), title)
-
-
-def _responses(
-    rollouts: Sequence[Rollout],
-    labels: Sequence[str],
-    joints: Sequence[str],
-    title: str,
-) -> Figure:
-    """Draw runs of the same joints, and setpoints and limits of the first."""
     runs = [_blank_failed(rollout) for rollout in rollouts]
     run = runs[0]
+    names = run.info.joint_names
+    for other in runs[1:]:
+        if other.info.joint_names != names:
+            problem = f"have the joints {', '.join(other.info.joint_names)}, too"
+            remedy = f"compare runs with the joints {', '.join(names)}"
+            raise InvalidArgumentError("rollouts", problem, remedy=remedy)
+    prefixes = [f"{label}: " for label in labels] or [""]
     command = run.info.own_command
     entries = []
     if command is not None and not run.info.sets_positions:
         entries = [f"setpoint {label}" for label in command.labels]
-    figure, chosen, blocks = _joint_axes(runs, joints, 2, title, entries)
+    chosen = [names.index(choice("joints", joint, names)) for joint in joints or names]
+    titles = [*(names[index] for index in chosen), *entries]
+    figure, blocks = _grid(titles, 2, title, max(run.time[-1] for run in runs))
     # Joints come first, entries of another command after them.
     for joint, (above, below) in zip(chosen, blocks, strict=False):
-        _draw_positions(above, runs, labels, joint)
-        _draw_efforts(below, runs, labels, joint)
+        _draw_positions(above, runs, prefixes, joint)
+        _draw_efforts(below, runs, prefixes, joint)
     pose = run.tool_pose
     setpoint = rollouts[0].setpoint
     if pose is not None:
@@ -225,23 +179,6 @@ def save(figure: Figure, path: str | Path, dpi: int = 110) -> Path:
 
 
 # -- parts of a figure
-
-
-def _joint_axes(
-    runs: Sequence[Rollout],
-    joints: Sequence[str],
-    rows: int,
-    title: str = "",
-    labels: Sequence[str] = (),
-) -> tuple[Figure, list[int], list[list[Axes]]]:
-    """Return a figure, the indices of the chosen joints, and the axes of each, and of each of
-    ``labels``.
-    """
-    names = runs[0].info.joint_names
-    chosen = [names.index(choice("joints", joint, names)) for joint in joints or names]
-    titles = [*(names[index] for index in chosen), *labels]
-    figure, blocks = _grid(titles, rows, title, max(run.time[-1] for run in runs))
-    return figure, chosen, blocks
 
 
 def _grid(
@@ -389,9 +326,7 @@ def _draw_efforts(
     labels: Sequence[str],
     joint: int,
 ) -> None:
-    """Draw efforts against the limit of the first run, with their peak and its share of saturated
-    samples.
-    """
+    """Draw efforts against the limit of the first run."""
     info = runs[0].info
     limit = float(info.effort_limit[joint])
     _draw_limits(axes, -limit, limit)
@@ -403,16 +338,6 @@ def _draw_efforts(
     ends = [limit, -limit] if peak > 0.2 * limit else []
     unit = OBSERVED["effort"].unit_for(info.units[joint])
     _show(axes, np.concatenate([values, [0.0], ends]), unit)
-    share = np.mean([run.saturated[..., joint].mean() for run in runs])
-    axes.text(
-        1,
-        1,
-        f"peak {peak:.3g} of ±{limit:g} {unit}, saturated {share:.0%}",
-        transform=axes.transAxes,
-        ha="right",
-        va="bottom",
-        fontsize=6.5,
-    )
 
 
 def _show(axes: Axes, values: Rows, unit: str) -> None:

@@ -26,7 +26,6 @@ from typing import NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
-from batchpid.arrays.elementwise import TURN, wrap
 from batchpid.checks import choice, file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.robot.robot import Robot
@@ -37,8 +36,6 @@ TIME_TOLERANCE = 0.2
 """Largest error of a time, over the time step: times of files are rounded."""
 LONGEST_ROW_TIME = 1.0
 """Longest time from row to row [s]."""
-STEP = 2.0
-"""Speed of a setpoint, in velocity limits, above which its change over a tick counts as a step."""
 
 
 class Setpoints(NamedTuple):
@@ -54,12 +51,6 @@ class Setpoints(NamedTuple):
     """None where the file has no accelerations."""
     substeps: int
     """Sim steps of a tick."""
-    has_rates: bool
-    """False if the rates are central differences."""
-    steps: int
-    """Number of changes that count as steps of the setpoint, with rate 0."""
-    period: float
-    """Time from row to row [s]."""
 
 
 def _quoted(name: str) -> str:
@@ -91,46 +82,39 @@ def read_csv(
     except UnicodeDecodeError as bad:
         problem = f"is not text: {bad.reason} at byte {bad.start}"
         raise error(source, problem, "save it as UTF-8") from None
-    delimiter = ","
-    header = list[str]()
+    lines = [
+        (number, line)
+        for number, line in enumerate(text.splitlines(), 1)
+        if line.partition("#")[0].strip()
+    ]
     rows = list[list[float]]()
-    numbers = list[int]()
-    for number, line in enumerate(text.splitlines(), 1):
-        if not line.partition("#")[0].strip():
-            continue
+    header = list[str]()
+    if lines:
         # Programs separate cells by other characters, and quote the names.
-        if not header:
-            delimiter = max(",;\t", key=re.sub('"[^"]*"', "", line).count)
-        try:
-            cells = _cells(line, delimiter)
-        except csv.Error as bad:
-            raise error(source, f"line {number}: {bad}", "correct the line") from None
-        if not header:
-            header = [re.sub(r"\s*:\s*", ":", cell, count=1) for cell in cells]
-            continue
-        if len(cells) != len(header):
-            problem = f"line {number} has {len(cells)} cells, the header {len(header)}"
-            raise error(source, problem, "complete or remove the line")
-        numbers.append(number)
-        try:
-            rows.append([float(cell) for cell in cells])
-        except ValueError:  # a cell is empty, or text
-            place = f"line {number}, column"
-            named = zip(header, cells, strict=True)
-            rows.append([_number(source, place, name, cell, quantities) for name, cell in named])
+        delimiter = max(",;\t", key=re.sub('"[^"]*"', "", lines[0][1]).count)
+        names, *table = csv.reader(
+            [line for _, line in lines], delimiter=delimiter, skipinitialspace=True
+        )
+        header = [re.sub(r"\s*:\s*", ":", name.strip(), count=1) for name in names]
+        numbers = [number for number, _ in lines[1:]]
+        for number, cells in zip(numbers, table, strict=False):
+            if len(cells) != len(header):
+                problem = f"line {number} has {len(cells)} cells, the header {len(header)}"
+                raise error(source, problem, "complete or remove the line")
+            try:
+                rows.append([float(cell) for cell in cells])
+            except ValueError:  # a cell is empty, or text
+                place = f"line {number}, column"
+                named = zip(header, cells, strict=True)
+                rows.append(
+                    [_number(source, place, name, cell, quantities) for name, cell in named]
+                )
     if not rows:
         raise error(source, "has no rows", "give a header and one row per sample")
     columns = dict(zip(header, np.array(rows).T, strict=False))
     if len(columns) < len(header):
         raise error(source, "has two columns with the same name", "rename one of them")
     return columns, numbers
-
-
-def _cells(line: str, delimiter: str) -> list[str]:
-    """Return the cells of a line: those in double quotes as they are, others without blanks."""
-    if '"' in line:
-        return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
-    return [cell.strip(" '") for cell in line.split(delimiter)]
 
 
 def _number(
@@ -144,7 +128,7 @@ def _number(
     quantity.
     """
     try:
-        return float(cell or "nan")
+        return float(cell.strip() or "nan")
     except ValueError:
         if column.partition(":")[0] not in (*quantities, "time"):
             return math.nan
@@ -201,8 +185,7 @@ def read_setpoints(robot: Robot, path: str | os.PathLike[str], timestep: float |
     any distance, one each "sim step".
 
     Rates that the file does not give are central differences, the short way round on continuous
-    joints, and 0 where the setpoint makes a step. Without a row at time 0, the robot's start pose
-    is the row before the first.
+    joints. Without a row at time 0, the robot's start pose is the row before the first.
 
     Raises
     ------
@@ -225,44 +208,18 @@ def read_setpoints(robot: Robot, path: str | os.PathLike[str], timestep: float |
     if at_zero:
         start = tables["setpoint"][0]
         tables = {quantity: rows[1:] for quantity, rows in tables.items()}
-    position = tables["setpoint"]
-    period, steps = substeps * timestep, 0
-    has_rates = "setpoint_rate" in tables
-    if has_rates:
-        rate = tables["setpoint_rate"]
-    else:
+    if "setpoint_rate" not in tables:
         first = robot.start if start is None else start
-        rate, steps = _rates(robot, np.vstack([first, position]), period)
+        rows = np.vstack([first, tables["setpoint"]])
+        rows[:, robot.continuous] = np.unwrap(rows[:, robot.continuous], axis=0)
+        tables["setpoint_rate"] = np.gradient(rows, substeps * timestep, axis=0)[1:]
     return Setpoints(
         start,
-        position,
-        rate,
+        tables["setpoint"],
+        tables["setpoint_rate"],
         tables.get("setpoint_acceleration"),
         substeps,
-        has_rates,
-        steps,
-        period,
     )
-
-
-def _rates(robot: Robot, position: Float64, dt: float) -> tuple[Float64, int]:
-    """Return the rates (ticks, dof) at the ends of ticks of ``dt`` [s] between rows (ticks + 1,
-    dof), and the steps.
-
-    A rate is the mean of the changes before and after, or the change before the last row or a step;
-    0 in a step.
-    """
-    period = np.where(robot.continuous, 1 / TURN, 0.0)
-    change = wrap(np.diff(position, axis=0), period, np) / dt
-    is_step = np.abs(change) > STEP * robot.velocity_limit
-    following = np.concatenate([change[1:], change[-1:]])
-    following = np.where(
-        np.concatenate([is_step[1:], is_step[-1:]]),
-        change,
-        following,
-    )
-    rate = np.where(is_step, 0.0, 0.5 * (change + following))
-    return rate, int(is_step[:, robot.independent].sum())
 
 
 def _tables(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -18,7 +19,7 @@ from batchpid.arrays.trees import digest
 from batchpid.checks import entries, instance
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import DRIVEN, JOINT_SIDE
-from batchpid.sim.description.merging import coupling_of, narrowed
+from batchpid.sim.description.merging import coupling_of
 from batchpid.sim.description.tables import Joint
 from batchpid.sim.engine.protocol import load_engine
 from batchpid.sim.engine.scene_spec import SceneSpec
@@ -130,12 +131,17 @@ def setpoint_guard(
     """Return the limits of setpoints of the degrees of freedom ``joints``, of the URDF where they
     are not given.
 
-    Followers have none: their limits narrow the limits of their leaders.
+    Followers have none: their limits are those of their leaders (:func:`couple`).
 
     Raises InvalidArgumentError if a follower of a continuous joint has position limits.
     """
+    for joint in joints:
+        if joint.continuous and math.isfinite(joint.lower):
+            problem = "turns without end, and cannot hold the position limits of its follower"
+            remedy = "make it revolute with limits, or remove those of the follower"
+            raise InvalidArgumentError("guard", problem, joint=joint.name, remedy=remedy)
     accelerations = [joint.acceleration_limit for joint in joints]
-    limits = bp.make_guard(
+    guard = bp.make_guard(
         len(joints),
         lower=[max(joint.lower, joint.soft_lower) for joint in joints],
         upper=[min(joint.upper, joint.soft_upper) for joint in joints],
@@ -144,7 +150,12 @@ def setpoint_guard(
         continuous=[joint.continuous for joint in joints],
         joint_names=[joint.name for joint in joints],
     )
-    return _of_leaders(limits, joints)
+    leads = coupling_of(tuple(joints)).independent
+    leaves = {}
+    for name, none in _NO_LIMIT.items():
+        if (leaf := getattr(guard, name)) is not None:
+            leaves[name] = np.where(leads, leaf, none)
+    return guard._replace(**leaves)
 
 
 def fit_guard(
@@ -156,8 +167,7 @@ def fit_guard(
 ) -> bp.Guard | None:
     """Return the guard for a runner's option ``guard``; None means no guard.
 
-    Raises InvalidArgumentError if it does not fit the robot or the control, or limits the positions
-    of a follower of a continuous joint.
+    Raises InvalidArgumentError if it does not fit the robot or the control, or limits a follower.
     """
     if guard is False or guard is None:
         return None
@@ -167,43 +177,15 @@ def fit_guard(
         raise InvalidArgumentError("guard", problem, value=control, remedy=remedy)
     limits = setpoint_guard(joints, None, None) if guard is True else guard
     limits = instance("guard", limits, bp.Guard, "pass True, or robot.guard(...)")
-    limits.check(num_envs, [joint.name for joint in joints])
-    return frozen(_of_leaders(limits, joints))
-
-
-def _of_leaders(guard: bp.Guard, joints: Sequence[Joint]) -> bp.Guard:
-    """Return ``guard`` with limits of the leaders that hold for their followers, too, and none of
-    the followers.
-
-    Position limits of a follower that leave its leader no range are left out, as in a robot's own
-    limits.
-    """
-    coupling = coupling_of(tuple(joints))
-    if coupling.is_identity:  # its limits keep their shapes
-        return guard
-    shape = max((np.shape(leaf) for leaf in guard if leaf is not None), default=(1, len(joints)))
-    limits = {}
-    for name, none in _NO_LIMIT.items():
-        leaf = getattr(guard, name)
-        limits[name] = np.broadcast_to(none if leaf is None else leaf, shape).astype(np.float64)
-    ends = np.stack([limits["lower"], limits["upper"]])
-    # A leader that turns without end takes its follower anywhere.
-    turns = np.array([joints[leader].continuous for leader in coupling.leader])
-    held = turns & ~coupling.independent & np.isfinite(ends).any((0, 1))
-    for index in np.flatnonzero(held).tolist():
-        leader = joints[coupling.leader[index]].name
-        problem = f"cannot hold the position limits of its follower {joints[index].name!r}"
-        remedy = "make the leader revolute with limits, or leave out lower and upper"
-        raise InvalidArgumentError("guard", problem, joint=leader, remedy=remedy)
-    limits["lower"], limits["upper"] = narrowed(coupling, *ends)
-    for name in ("rate", "acceleration"):
-        fastest = limits[name] / np.abs(coupling.multiplier)
-        np.minimum.at(limits[name].T, coupling.leader, fastest.T)
-    leaves = {}
-    for name, none in _NO_LIMIT.items():
-        limits[name][:, coupling.followers] = none
-        leaves[name] = None if np.isinf(limits[name]).all() else limits[name]
-    return guard._replace(**leaves)
+    joint_names = [joint.name for joint in joints]
+    limits.check(num_envs, joint_names)
+    leads = coupling_of(tuple(joints)).independent
+    for name in _NO_LIMIT:
+        if (leaf := getattr(limits, name)) is not None:
+            free = leads | np.isinf(leaf)
+            remedy = "limit its leader, or use robot.guard(...), which limits leaders alone"
+            entries(name, leaf, free, "limits a follower", joint_names, remedy=remedy)
+    return frozen(limits)
 
 
 def scene_of(

@@ -144,8 +144,6 @@ class Runner(SingleOwner):
             self._call.end()
         self.reset(seed=None if self.options.randomization is None else 0)
         self._check_stability()
-        if isinstance(self.control, OperationalSpace):
-            self.control.check_stability()
 
     def _check_stability(self) -> None:
         """Warn of gains beyond the stability bound of the sampled loop."""

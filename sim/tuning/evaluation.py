@@ -317,10 +317,9 @@ class Comparison:
 
         shown = self.evaluations[:2]
         runs = [evaluation.rollout.for_envs(slice(0, 1)) for evaluation in shown]
+        labels = [evaluation.name for evaluation in shown]
         title = f"{self.robot.name}, {shown[0].moves.names[0]} move"
-        if len(runs) == 1:
-            return plots.step_responses(runs[0], title=title)
-        return plots.comparison(*runs, labels=(shown[0].name, shown[1].name), title=title)
+        return plots.step_responses(*runs, labels=labels, title=title)
 
     def _row(self, evaluation: Evaluation) -> list[str]:
         """Return the row of an evaluation in the table."""

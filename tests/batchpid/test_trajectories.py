@@ -105,7 +105,7 @@ def test_a_move_of_no_distance_rests(move):
 
 
 def test_the_end_of_a_trajectory_can_be_held():
-    t = minimum_jerk([0.0, 0.0], [1.0, 2.0], DT, duration=0.1).hold(0.02)
+    t = minimum_jerk([0.0, 0.0], [1.0, 2.0], DT, duration=0.1, hold=0.02)
     assert t.ticks == 25 + 5
     np.testing.assert_allclose(t.time, DT * np.arange(1, 31))
     assert (t.position[25:] == [1.0, 2.0]).all()

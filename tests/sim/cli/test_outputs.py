@@ -9,8 +9,7 @@ from commands_that_write import SHORT, WORDS, output, output_flags
 @pytest.fixture
 def empty_pictures(monkeypatch):
     """Make commands write empty files in place of pictures: only their names matter."""
-    for name in ("step_responses", "efforts"):
-        monkeypatch.setattr(f"batchpid.sim.plots.{name}", lambda *_, **__: None)
+    monkeypatch.setattr("batchpid.sim.plots.step_responses", lambda *_, **__: None)
     monkeypatch.setattr(
         "batchpid.sim.plots.save",
         lambda _, path: (path.parent.mkdir(exist_ok=True), path.touch()) and path,

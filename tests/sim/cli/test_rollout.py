@@ -9,7 +9,7 @@ from tiny_urdf import gripper, joint, link, write
 
 import batchpid as bp
 from batchpid.sim import Robot, Runner, read_recording
-from batchpid.trajectories import Trajectory, minimum_jerk
+from batchpid.trajectories import minimum_jerk
 
 SHORT = ("--num-envs", 3, "--workers", 0, "--seconds", 0.05)
 FILE = "run.h5"
@@ -118,12 +118,6 @@ def csv(robot, motion, *further, start=True, delimiter=",", end="\n", header="{}
     return "".join(delimiter.join(row) + end for row in cells)
 
 
-def through(poses):
-    """Return a motion in ticks of 10 ms through poses, whose first is at time 0."""
-    poses = np.array(poses)
-    return Trajectory(0.01 * np.arange(len(poses)), poses, 0 * poses, 0 * poses)
-
-
 def following_errors(report):
     """Return the largest following errors of all envs (joints,), as the report prints them."""
     rows = [line.split() for line in report.splitlines() if line.startswith("panda_")]
@@ -131,14 +125,13 @@ def following_errors(report):
     return np.array([float(row[4]) for row in rows])
 
 
-@pytest.mark.parametrize("source", ["from the file", "central differences of the rows"])
+@pytest.mark.parametrize("further", [["setpoint_rate"], []])
 def test_a_trajectory_is_followed_as_by_a_runner_with_its_rates(
-    saved, tmp_path, panda, motion, source
+    saved, tmp_path, panda, motion, further
 ):
-    path, further = tmp_path / "motion.csv", ["setpoint_rate"] if source == "from the file" else []
+    path = tmp_path / "motion.csv"
     path.write_text(csv(panda, motion, *further))
     run, said = saved("--trajectory", path, short=ONE)
-    assert f"Rates of the setpoints: {source}." in said
     rows = np.loadtxt(path, delimiter=",", skiprows=1)[:, 1:]
     rates = rows[:, 9:] if further else np.gradient(rows, 0.005, axis=0)
     with Runner(panda, 1, workers=0, params=panda.tuned(), substeps=10) as runner:
@@ -179,14 +172,6 @@ def test_files_of_other_programs_read_as_those_of_this_one(saved, tmp_path, pand
         runs.append(saved("--trajectory", path, "--engine", "mujoco", short=ONE)[0].arrays())
     for name, rows in runs[0].items():
         np.testing.assert_array_equal(rows, runs[1][name])
-
-
-def test_changes_beyond_the_velocity_limits_are_steps(batchpid, tmp_path, panda):
-    path = tmp_path / "step.csv"
-    poses = [panda.start, panda.start, panda.settings.target, panda.settings.target]
-    path.write_text(csv(panda, through(poses), start=False))
-    steps = np.count_nonzero(panda.settings.target != panda.start)
-    assert f"{steps} steps of the setpoints" in batchpid("rollout", "--trajectory", path, *ONE)[1]
 
 
 def test_rates_take_the_short_way_round_and_followers_need_no_column(saved, tmp_path):

@@ -15,8 +15,8 @@ def moves(robot, count=N, seed=0):
     low, high = np.maximum(robot.lower, -2.5), np.minimum(robot.upper, 2.5)
     share = np.random.default_rng(seed).uniform(0.4, 0.6, (2, count, robot.dof))
     start, target = robot.coupling.positions(low + share * (high - low))
-    move = minimum_jerk(start, target, DT, max_velocity=0.5 * robot.velocity_limit)
-    return start, move.hold(0.2)
+    limit = 0.5 * robot.velocity_limit
+    return start, minimum_jerk(start, target, DT, max_velocity=limit, hold=0.2)
 
 
 def follow(robot, start, move, *, rates=True, accelerations=False, **options):

@@ -44,7 +44,7 @@ def move_of(arm, dt):
     way = np.where(high - start > start - low, 0.8, -0.8)
     margin = 0.02 * (high - low)
     goal = arm.coupling.positions(np.clip(start + way, low + margin, high - margin))
-    return start, minimum_jerk(start, goal, dt, duration=DURATION).hold(HELD)
+    return start, minimum_jerk(start, goal, dt, duration=DURATION, hold=HELD)
 
 
 def largest_error(arm, dt, params, engine="sapien", substeps=1):

@@ -65,14 +65,12 @@ def test_limits_of_a_follower_hold_under_the_guard(multiplier, offset, engine, t
     robot = Robot.load(
         write(tmp_path, urdf(*parts, joint("b", "base", "two", inner=slow + law + soft)))
     )
-    for guard in (
-        robot.guard(),
-        bp.make_guard(2, lower=[-2, -1], upper=[2, 1.5], rate=[np.inf, 2.0]),
-    ):
-        with Runner(robot, 1, workers=0, guard=guard, ground=False, engine=engine) as runner:
-            runner.reset([0.0, 0.0])
-            seen = runner.rollout(np.tile([2.0 * np.sign(multiplier), 0.0], (250, 1)))
-        assert np.abs(seen.qvel[..., 1]).max() < 2.0
-        np.testing.assert_allclose(
-            seen.qpos[-1, 0, 1], min(1.5, 2.0 * abs(multiplier) + offset), atol=5e-3
-        )
+    with Runner(robot, 1, workers=0, guard=True, ground=False, engine=engine) as runner:
+        runner.reset([0.0, 0.0])
+        seen = runner.rollout(np.tile([2.0 * np.sign(multiplier), 0.0], (250, 1)))
+    assert np.abs(seen.qvel[..., 1]).max() < 2.0
+    np.testing.assert_allclose(
+        seen.qpos[-1, 0, 1], min(1.5, 2.0 * abs(multiplier) + offset), atol=5e-3
+    )
+    with pytest.raises(bp.InvalidArgumentError, match=r"rate.*'b'.*limits a follower.*leader"):
+        Runner(robot, 1, workers=0, guard=bp.make_guard(2, rate=[np.inf, 2.0]))

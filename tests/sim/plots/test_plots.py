@@ -49,8 +49,6 @@ def test_every_joint_has_its_axes_in_its_units():
     assert [axes.get_title(loc="left") for axes in named] == list(rollout.info.joint_names)
     assert [axes.get_ylabel() for axes in named] == ["rad", "m"]
     assert [axes.get_ylabel() for axes in others] == ["N m", "N"]
-    named, others = split_axes(plots.efforts(rollout))
-    assert (len(named), len(others)) == (2, 0)
 
 
 def is_drawn(axes, values):
@@ -76,9 +74,8 @@ def test_fan_holds_every_env_and_the_line_is_the_median():
 
 
 def test_limits_far_from_the_efforts_do_not_flatten_them():
-    (axes,), _ = split_axes(plots.efforts(make(1, effort_limit=np.array([1e4]))))
+    _, (axes,) = split_axes(plots.step_responses(make(1, effort_limit=np.array([1e4]))))
     assert axes.get_ylim()[1] < 20
-    assert any("of ±10000 N m" in text.get_text() for text in axes.texts)
 
 
 def test_a_run_that_diverges_is_shown_near_its_limits():
@@ -115,8 +112,7 @@ def test_any_run_can_be_drawn(tmp_path_factory, bad, first, envs, limits, unit, 
     folder = tmp_path_factory.mktemp("plots")
     for name, figure in (
         ("step", plots.step_responses(rollout)),
-        ("efforts", plots.efforts(rollout)),
-        ("comparison", plots.comparison(rollout, make(1))),
+        ("two", plots.step_responses(rollout, make(1), labels=["a", "b"])),
     ):
         assert plots.save(figure, folder / f"{name}.png", dpi=40).stat().st_size > 1000
 
@@ -133,13 +129,14 @@ def test_nothing_is_drawn_of_an_env_after_it_failed():
             np.testing.assert_array_equal(np.isnan(drawn.T), ~rollout.ok)
 
 
-def test_comparison_takes_runs_of_other_lengths_but_not_of_other_joints():
-    figure = plots.comparison(make(1), make(1, ticks=2 * TICKS, envs=2), labels=("run", "other"))
+def test_two_runs_may_have_other_lengths_but_not_other_joints():
+    runs = make(1), make(1, ticks=2 * TICKS, envs=2)
+    figure = plots.step_responses(*runs, labels=("run", "other"))
     assert all(axes.get_xlim()[1] == pytest.approx(0.6) for axes in figure.axes)
     legend = [text.get_text() for text in figure.legends[0].get_texts()]
     assert {"run: each env", "run: median", "other: median"} <= {*legend}
     with pytest.raises(InvalidArgumentError, match="joint1"):
-        plots.comparison(make(1), make(2))
+        plots.step_responses(make(1), make(2))
 
 
 def test_joints_by_name():

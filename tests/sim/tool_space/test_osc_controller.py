@@ -2,8 +2,6 @@
 arguments.
 """
 
-import warnings
-
 import numpy as np
 import pytest
 from osc_arms import START, six
@@ -12,7 +10,7 @@ from robots import load_bundled
 import batchpid.task_space as ts
 from batchpid.errors import InvalidArgumentError, RobotError
 from batchpid.native.array_program import SWITCH
-from batchpid.sim import OperationalSpace, Robot, Runner, StabilityWarning
+from batchpid.sim import OperationalSpace, Robot, Runner
 from batchpid.task_space.frames import about, compose
 
 HAND = "panda_hand"
@@ -159,20 +157,14 @@ def test_arguments_are_checked(panda, argument, options):
     assert caught.value.argument == argument
 
 
-def test_gains_that_the_time_step_makes_unstable_are_a_warning_unless_implicit(panda):
+def test_gains_that_the_time_step_makes_unstable_are_refused_unless_implicit(panda):
     options = {"workers": 0, "timestep": 1 / 100}
-    with (
-        pytest.warns(
-            StabilityWarning, match=r"stiffness, 'x': 10000 .* 1.25 times .*implicit"
-        ) as seen,
-        Runner(panda, 1, control=OperationalSpace(panda, HAND, stiffness=1e4), **options),
-    ):
-        assert seen[0].filename == __file__
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        control = OperationalSpace(panda, HAND, stiffness=1e4, discretization="implicit")
-        Runner(panda, 1, control=control, **options).close()
-        Runner(panda, 1, control="osc", **options).close()
+    message = r"^stiffness, entry 'x': is unstable at a time step of 0.01 s .*implicit"
+    with pytest.raises(InvalidArgumentError, match=message):
+        Runner(panda, 1, control=OperationalSpace(panda, HAND, stiffness=1e4), **options)
+    control = OperationalSpace(panda, HAND, stiffness=1e4, discretization="implicit")
+    Runner(panda, 1, control=control, **options).close()
+    Runner(panda, 1, control="osc", **options).close()
 
 
 def test_the_robot_is_that_of_the_runner(panda, six_joints):
