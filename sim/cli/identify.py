@@ -95,7 +95,7 @@ def identify_logs(
     gains: Annotated[
         str | None,
         flag(
-            "Gains of the PID law that drove the robot: a params file (.yaml or .json), or a name or"
+            "Gains of the PID law that drove the robot: a params file (.yaml), or a name or"
             " file as for --gains of other commands. Without it a recording's own, or the logs'"
             " efforts.",
             "NAME|FILE",

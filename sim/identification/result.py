@@ -219,7 +219,7 @@ class Identification:
         return bp.make_actuators(robot.dof, **options, joint_names=robot.joint_names)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write :meth:`actuators` to a .yaml or .json file, with estimates, errors and the
+        """Write :meth:`actuators` to a .yaml file, with estimates, errors and the
         confidence region.
         """
         region = {
