@@ -24,7 +24,7 @@ from batchpid.sim.cli.rollout import demo, rollout
 from batchpid.sim.cli.show import inspect_robot, plot, view
 
 PICTURES = (".png", ".svg")
-DOCUMENTS = (".yaml", ".yml", ".json")
+DOCUMENTS = (".yaml", ".yml")
 DEFAULT_ROBOT = "panda"
 FOLDER = Path("out")
 """Folder of default outputs, which is made when a file is written; other folders have to exist."""
@@ -80,10 +80,7 @@ COMMANDS = {
     ),
     "identify": CommandFunction(
         identify_logs,
-        {
-            "out": Output("Actuators file", DOCUMENTS, "out/{robot}.actuators.yaml"),
-            "picture": PICTURE,
-        },
+        {"out": Output("Actuators file", DOCUMENTS, "out/{robot}.actuators.yaml")},
         ("base",),
     ),
     "export": CommandFunction(

@@ -515,14 +515,6 @@ class Runner(SingleOwner):
         return self._state.steps * self.timestep
 
     @property
-    def work_seconds(self) -> NDArray[np.float64]:
-        """Seconds of work of each worker in the last tick; after a rollout, the mean over the ticks
-        of one request.
-        """
-        seconds, ticks = self._state.work
-        return np.array(seconds) / ticks
-
-    @property
     def recoveries(self) -> int:
         """Number of lost workers that were replaced."""
         return self._pool.recoveries
@@ -639,19 +631,16 @@ class Runner(SingleOwner):
         """
         call = self._call
         pool = self._pool
-        is_run = request.method == "run"
         self._prepare(request)
         # From here on Ctrl-C waits, so that workers and state change together or not at all.
         call.begin()
         try:
             call.waits = True
-            pool.begin(request)
-            outcome = pool.finish()
+            outcome = pool.run(request)
             call.waits = False
-            # Ticks before a failure count: the workers have run them.
-            if outcome.failure is None or is_run:
+            if outcome.failure is None:
                 self._state = committed(self.options, self._state, outcome)
-            if outcome.failure is not None and request.changes_loop:
+            elif request.changes_loop:
                 self._fail(outcome.failure.error)
         except BaseException as error:
             self._fail(error)
