@@ -47,7 +47,6 @@ PHASES = {
     "control": ("#e08a3c", "control"),
     "read": ("#5aa469", "reading"),
     "write": ("#b45f82", "writing"),
-    "waiting": ("#d9d9d9", "waiting"),
 }
 
 

@@ -147,8 +147,7 @@ def measure_phases(workload: Workload) -> dict[str, float]:
     Measured in this process with a worker's share of the envs. The control step runs in NumPy, with
     native calls into the engine if available, because the phases of a native tick cannot be
     separated. "control" is everything except calls into the engine; it takes a fraction of that
-    time in a native tick. The clock calls add about one percent. "waiting" is the mean time of a
-    tick of :meth:`Runner.step` beyond the work of a worker.
+    time in a native tick. The clock calls add about one percent.
     """
     share = max(1, workload.num_envs // workload.processes)
     robot = workload.simulated_robot()
@@ -163,16 +162,18 @@ def measure_phases(workload: Workload) -> dict[str, float]:
     places = np.tile(workload.start, (share, 1)), np.zeros((share, robot.dof))
     loop.execute("reset", (np.ones(share, bool), *places, NOTHING, None))
     loop.arrays.command.setpoint[...] = workload.target
-    spent = dict.fromkeys(("read", "control", "passive", "write", "step", "waiting"), 0.0)
+    spent = dict.fromkeys(("read", "control", "passive", "write", "step"), 0.0)
     for group in loop.groups:
         _time_calls(group.pack, spent)
     given = Command(workload.target).given
-    total = sum(loop.execute("run", (1, workload.substeps, given)) for _ in range(workload.ticks))
+    began = time.perf_counter()
+    for _ in range(workload.ticks):
+        loop.execute("run", (1, workload.substeps, given))
+    total = time.perf_counter() - began
     loop.close()
     shared.close()
     env_steps = workload.steps * share
     spent["control"] = total - sum(spent.values())
-    spent["waiting"] = _waiting(workload) * env_steps
     return {phase: seconds / env_steps * 1e6 for phase, seconds in spent.items()}
 
 
@@ -191,18 +192,6 @@ def _time_calls(pack: EnginePack, spent: dict[str, float]) -> None:
     for phase, names in PHASES.items():
         for name in names:
             setattr(pack, name, timed(phase, getattr(pack, name)))
-
-
-def _waiting(workload: Workload) -> float:
-    """Return the mean seconds per env step of a tick beyond the work of a worker."""
-    with workload.runner() as runner:
-        runner.step(workload.target)
-        idle = 0.0
-        for _ in range(workload.ticks):
-            began = time.perf_counter()
-            runner.step(workload.target)
-            idle += time.perf_counter() - began - float(np.mean(runner.work_seconds))
-    return idle / (workload.steps * workload.num_envs / workload.processes)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from batchpid.sim.loop.faults import Fault, FaultWarning
     from batchpid.sim.options.groups import Controller
     from batchpid.sim.options.options import RunnerOptions
-    from batchpid.sim.randomization.distributions import Choice, LogUniform, Normal, Uniform
+    from batchpid.sim.randomization.distributions import LogUniform, Normal, Uniform
     from batchpid.sim.randomization.randomization import Randomization
     from batchpid.sim.recording.recording_files import (
         RecordingError,
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from batchpid.sim.workers.pool import RecoveryWarning
 
 __all__ = [
-    "Choice",
     "CommandSpec",
     "Controller",
     "Fault",
@@ -71,7 +70,6 @@ __all__ = [
 _MODULES = ("gym", "identification", "plots", "tuning", "view")
 """Public modules, which are imported when they are used."""
 _PLACES = {
-    "Choice": "batchpid.sim.randomization.distributions",
     "CommandSpec": "batchpid.sim.signals",
     "Controller": "batchpid.sim.options.groups",
     "Fault": "batchpid.sim.loop.faults",

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Document, Float64, Rows
+from batchpid.arrays.array_types import Float64, Rows
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import PIDParams
 from batchpid.motors import Actuators
@@ -127,8 +127,8 @@ class RunInfo:
     """Local date and time of the start, ISO 8601."""
     faults: tuple[Any, ...] = ()
     """Faults (:class:`batchpid.sim.Fault`) of the runner up to the end of the run."""
-    randomization: Document | None = None
-    """Distributions, as :meth:`batchpid.sim.Randomization.to_dict` returns them."""
+    randomization: str | None = None
+    """Text of the :class:`batchpid.sim.Randomization`."""
     draws: Mapping[str, Float64] | None = None
     """Draws at the start, by field: (envs, joints or links)."""
     episodes: NDArray[np.int64] | None = None

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Bool, DType, Float32, Rows
-from batchpid.checks import array
+from batchpid.checks import array, instance
 from batchpid.checks import names as different_names
 from batchpid.errors import InvalidArgumentError
 
@@ -114,18 +114,14 @@ def own_command(control: object) -> CommandSpec | None:
     Raises
     ------
     InvalidArgumentError
-        The attribute is neither a CommandSpec nor a sequence of names.
+        The attribute is no CommandSpec.
     """
     # A control that is a word has no attribute of this name.
     command = getattr(control, "command", None)
-    if command is None or isinstance(command, CommandSpec):
-        return command
-    try:
-        return CommandSpec(command)
-    except InvalidArgumentError as error:
-        problem = f"has an attribute 'command' whose {error.argument} {error.problem}"
-        remedy = "use a batchpid.sim.CommandSpec, or names such as ('x', 'y')"
-        raise InvalidArgumentError("control", problem, remedy=remedy) from None
+    if command is None:
+        return None
+    remedy = "let its attribute 'command' be a batchpid.sim.CommandSpec"
+    return instance("control", command, CommandSpec, remedy)
 
 
 class Quantity(NamedTuple):

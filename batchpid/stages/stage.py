@@ -37,13 +37,13 @@ class Stage:
     """Name of its state in snapshots."""
     after: ClassVar[str]
     """Name of the stage before it, for a stage of the caller's."""
-    native: ClassVar[str] = ""
+    native = ""
     """Entry of StageKind in tick.h that replaces ``step`` in native code; "": a trace of ``step`` runs."""
     every = 1
     """Sim steps of a tick from one run of a native stage to the next."""
-    calls_model: ClassVar[bool] = False
+    calls_model = False
     """Whether ``step`` calls functions of the robots' model, which no program has."""
-    is_brief: ClassVar[bool] = False
+    is_brief = False
     """Whether the state is made at the start of each tick, so that snapshots do not hold it."""
     starting: ClassVar[tuple[str, ...]] = ()
     """Constants that only ``init`` needs."""

@@ -214,6 +214,12 @@ class SpatialInertia(NamedTuple):
             self.mass, position + matrix @ self.center, matrix @ self.tensor @ matrix.T
         )
 
+    @property
+    def principal(self) -> tuple[Float64, Float64]:
+        """Principal moments (3,) [kg m^2] and axes (3, 3), the columns of a rotation."""
+        moments, axes = np.linalg.eigh(self.tensor)
+        return moments, axes * np.linalg.det(axes)
+
 
 def spatial_matrix(inertia: SpatialInertia) -> Float64:
     """Return the matrix S (6, 6) of the kinetic energy 1/2 (v, w)^T S (v, w), with v the velocity

@@ -43,7 +43,7 @@ BOUNDS = declared(RunnerKeywords, Field)
 """Ranges of the options that are numbers."""
 NumEnvs = Annotated[int, BOUNDS["num_envs"], flag("Number of robots, one in each scene.")]
 GAINS_FLAG = flag(
-    "Gains: tuned, designed, sapien-tutorial, mjcf, drive:STIFFNESS,DAMPING, or a params file (.yaml"
+    "Gains: tuned, designed, sapien-tutorial, mjcf, drive, or a params file (.yaml"
     " or .json) that `batchpid tune` or batchpid.save_params wrote. Default: tuned where the robot"
     " has them, else designed.",
     "NAME|FILE",

@@ -31,8 +31,6 @@ ENDINGS = {
     "urdf": ".urdf",
 }
 """Suffix of the file of each target."""
-COMMENTS = {"c": "/* {} */", "mjcf": "<!-- {} -->", "urdf": "<!-- {} -->"}
-"""Comment of a target's language; of the others "# {}"."""
 
 
 def tune(
@@ -109,16 +107,9 @@ class ExportedFile:
         return "\n".join(f"differs: {text}" for text in differences)
 
     def save(self, path: Path) -> None:
-        """Write the file, with a comment at its end for each difference that it does not name."""
+        """Write the file."""
         file_path("out", path, (ENDINGS[self.target],))
-        text, differences = self.exported
-        comment = COMMENTS.get(self.target, "# {}")
-        for difference in differences:
-            # Two hyphens would end a comment of XML, and */ one of C.
-            sentence = " ".join(difference.split()).replace("--", "- -").replace("*/", "* /")
-            if sentence not in text:
-                text += comment.format(f"differs: {sentence}") + "\n"
-        write_atomically(path, text)
+        write_atomically(path, self.exported.text)
 
 
 def export(

@@ -171,9 +171,7 @@ def view(
     num_envs: Annotated[int, Field(low=1, high=64), flag("Number of robots; 64 at most.")] = 16,
     gains: Gains = None,
     play: Annotated[Path | None, flag("Recorded run to show, .h5.", "FILE")] = None,
-    port: Annotated[
-        int, Field(low=1, high=65535), flag("Port, or a free one if it is taken.")
-    ] = 8080,
+    port: Annotated[int, Field(low=0, high=65535), flag("Port; 0 for a free one.")] = 8080,
     time_limit: Annotated[
         float | None, Field("s"), flag("Stop after this wall-clock time [s]. Default: none.")
     ] = None,

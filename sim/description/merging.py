@@ -7,7 +7,7 @@ links; shapes, inertias and joints of the others are placed in it. A link withou
 the inertia of its collision shapes.
 
 The engine numbers joints breadth first, fixed ones counted, so that a merge may change the order of
-the joints below it. Such fixed joints are kept.
+the joints below it. In such a robot only fixed joints without motion below them are merged.
 """
 
 from __future__ import annotations
@@ -146,8 +146,8 @@ def _within(at: Placement, position: Float64, wxyz: Float64) -> tuple[Float64, F
 
 
 def _merged_joints(joints: Sequence[Joint], separate: Separate) -> set[str]:
-    """Return the fixed joints to merge: all but the joints of ``separate`` links, and joints whose
-    merge would change the order of joints below them.
+    """Return the fixed joints to merge, without those of ``separate`` links: all, or, if that would
+    change the order of joints, all without motion below them.
     """
     order = [joint.name for joint in joints if joint.moves]
     # From the leaves to the root, so that one pass is enough.
@@ -159,12 +159,8 @@ def _merged_joints(joints: Sequence[Joint], separate: Separate) -> set[str]:
     merged = {joint.name for joint in fixed}
     if _moving_order(joints, merged) == order:
         return merged
-    # Else joints without motion below them first, then one by one what keeps the order.
-    merged = {joint.name for joint in fixed if joint.child_link not in carriers}
-    for joint in fixed:
-        if _moving_order(joints, merged | {joint.name}) == order:
-            merged.add(joint.name)
-    return merged
+    # Else the joints without motion below them.
+    return {joint.name for joint in fixed if joint.child_link not in carriers}
 
 
 def _moving_order(joints: Sequence[Joint], merged: Collection[str]) -> list[str]:

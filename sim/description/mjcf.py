@@ -91,26 +91,12 @@ def read_mjcf(
     # MuJoCo opens the file by its path, and workers do so again.
     if not path.is_file():
         raise RobotError(f"{path}: an MJCF file is read several times; save it as a file first")
-    try:
-        return _read(path, name, findings, fixed_base)
-    except UnicodeDecodeError as error:
-        raise RobotError(
-            f"{path}: a name is not UTF-8, which MuJoCo requires: {error}; save it as UTF-8"
-        ) from error
-
-
-def _read(
-    path: Path,
-    name: str,
-    findings: list[Finding],
-    fixed_base: bool | None,
-) -> Source:
     compiled = compile_scene(path)
     model = compiled.model
     robot = RobotInFile(model, path, findings)
     # A base is free where the file has a free joint, unless the caller fixes it.
     if fixed_base is None:
-        fixed_base = not (robot.base and model.body_jntnum[robot.base])
+        fixed_base = not robot.base
     couplings = read_couplings(robot)
     motors = read_motors(robot, couplings)
     tables = robot.read(couplings, motors, is_held=fixed_base)
@@ -270,7 +256,9 @@ def compile_scene(path: Path) -> Compiled:
     try:
         scene = mujoco.MjSpec.from_file(str(path))
         scene.compiler.discardvisual = True
-        return Compiled(scene, scene.compile())
+        model = scene.compile()
+        model.names.decode()  # MuJoCo requires UTF-8, and does not check it
+        return Compiled(scene, model)
     except (ValueError, mujoco.FatalError) as error:
         problem = " ".join(str(error).split())
         raise RobotError(

@@ -350,8 +350,9 @@ def _hull(model: MjModel, mesh: int) -> Float64:
 
 
 def _ellipsoid(radii: Float64) -> Float64:
-    """Return points (n, 3) on an ellipsoid, along a spiral from pole to pole (E. B. Saff and A. B.
-    J. Kuijlaars, "Distributing many points on a sphere", Math. Intelligencer 19, 1997).
+    """Return points (n, 3) on an ellipsoid, along a spiral from pole to pole that turns by the
+    golden angle (A. Gonzalez, "Measurement of areas on a sphere using Fibonacci and
+    latitude-longitude lattices", Math. Geosci. 42, 2010).
     """
     height = np.linspace(-1, 1, _POINTS)
     angle = np.arange(_POINTS) * np.pi * (3 - np.sqrt(5))

@@ -114,7 +114,7 @@ def read_motors(robot: RobotInFile, couplings: Couplings) -> JointMotors:
                 "no actuator of the file moves the joint: it is controlled like all others, without"
                 " compensation of gravity and friction"
             )
-            remedy = "give it gains of 0 to let it move freely, or pass free_joints=[] to a runner"
+            remedy = "give it gains of 0 to let it move freely, or a motor in the file"
             unmoved[joint] = True
             findings.append(Finding("actuator", text, remedy, name))
         # A limit of 0 counts as none.

@@ -8,7 +8,6 @@ import os
 from pathlib import Path
 
 import numpy as np
-from lxml import etree
 
 from batchpid import assets
 from batchpid.arrays.elementwise import read_only
@@ -53,7 +52,8 @@ def read_robot(path: Path, fixed_base: bool | None, package_dirs: tuple[Path, ..
     """
     findings: list[Finding] = []
     root = parse_xml(path, findings)
-    if is_mjcf(root):
+    # MuJoCo ignores a default namespace.
+    if root.tag == "mujoco":
         name = root.get("model") or path.stem
         source = read_mjcf(path, name, findings, fixed_base)
     else:
@@ -65,11 +65,6 @@ def read_robot(path: Path, fixed_base: bool | None, package_dirs: tuple[Path, ..
                 f"{path}: the name {name!r} has a control character or a line break; rename it"
             )
     return source
-
-
-def is_mjcf(root: etree._Element) -> bool:
-    """Return whether a root element is an MJCF file's; MuJoCo ignores a default namespace."""
-    return root.prefix is None and etree.QName(root).localname == "mujoco"
 
 
 def with_srdf(source: Source) -> Source:

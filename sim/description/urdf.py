@@ -6,6 +6,7 @@ repaired while it is read, with a finding each; the rest is an error.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from itertools import chain
 from pathlib import Path
@@ -24,7 +25,7 @@ from batchpid.sim.description.urdf_elements import (
 from batchpid.sim.findings import Finding
 
 MOST_READ = 4096  # links and joints of a file
-UNUSED = {"visual", "material", "transmission", "gazebo", "sensor", "ros2_control", "calibration"}
+_UNUSED = {"visual", "material", "transmission", "gazebo", "sensor", "ros2_control", "calibration"}
 """Elements of a URDF without effect on the motion."""
 _ELEMENTS = {
     "robot": {"link", "joint", "transmission"},
@@ -128,11 +129,12 @@ def _drop_unused(root: etree._Element, findings: list[Finding]) -> None:
         for child in list(parent):
             if child.tag in _ELEMENTS[parent.tag]:
                 continue
-            name = etree.QName(child)
-            if "xacro" in (name.namespace or ""):
-                unknown[f"<xacro:{name.localname}>"] += 1
-            elif name.localname not in UNUSED:
-                unknown[f"<{name.localname}>"] += 1
+            # With the namespace, or a prefix that nobody declared.
+            name = re.split("[:}]", child.tag)[-1]
+            if "xacro" in child.tag:
+                unknown[f"<xacro:{name}>"] += 1
+            elif name not in _UNUSED:
+                unknown[f"<{name}>"] += 1
             parent.remove(child)
     for element in root.iter(*_ATTRIBUTES):
         for key in sorted({*element.attrib} - _ATTRIBUTES[element.tag]):

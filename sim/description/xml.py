@@ -19,7 +19,10 @@ from batchpid.sim.findings import Finding
 from batchpid.sim.geometry.mesh_files import LARGEST_NUMBER, LFS_POINTER
 
 XML_SIZE_LIMIT = 2**25  # bytes of a file; its tree takes about ten times as much memory
-MOST_PREFIXES = 100  # of namespaces that nobody declared
+FAULTS = {"ERR_HYPHEN_IN_COMMENT", "NS_ERR_UNDEFINED_NAMESPACE"}
+"""Errors that other readers accept: ``--`` in comments, and prefixes of namespaces that nobody
+declared.
+"""
 
 
 def parse_xml(path: Path, repairs: list[Finding] | None = None) -> etree._Element:
@@ -40,7 +43,7 @@ def parse_xml(path: Path, repairs: list[Finding] | None = None) -> etree._Elemen
             )
         if data.startswith(LFS_POINTER):
             raise RobotError(f"{path}: a git-lfs pointer instead of the file; run git lfs pull")
-        root = _parse(data)
+        root, _errors = _parse(data)
     except etree.XMLSyntaxError as error:
         try:
             root = _lenient(data)
@@ -77,43 +80,38 @@ def _drop_default_namespace(root: etree._Element) -> None:
         etree.cleanup_namespaces(root)
 
 
-def _parse(data: bytes) -> etree._Element:
+def _parse(data: bytes, recover: bool = False) -> tuple[etree._Element, set[str]]:
+    """Return the root element, and the types of the errors in spite of which it was read."""
     parser = etree.XMLParser(
         resolve_entities=False,
         no_network=True,
         load_dtd=False,
         remove_comments=True,
         remove_pis=True,
+        recover=recover,
     )
-    return etree.fromstring(data, parser)
+    root = etree.fromstring(data, parser)
+    return root, {error.type_name for error in parser.error_log}
 
 
 def _lenient(data: bytes) -> etree._Element:
-    """Return the first ``<robot>``, or other element, of a file with faults in its XML that other
-    readers accept.
-
-    Accepted faults are: text or comments before the declaration or after the root, a wrong
-    encoding, ``--`` in comments, ``&`` alone, and prefixes of namespaces that nobody declared.
+    """Return the first ``<robot>``, or other element, of a file with :data:`FAULTS`, or with a
+    wrong encoding. Raises XMLSyntaxError for other faults.
     """
     utf16 = data.startswith((b"\xff\xfe", b"\xfe\xff"))
     try:
         text = data.decode("utf-16" if utf16 else "utf-8-sig")
     except UnicodeDecodeError:
         text = data.decode("latin-1")
-    # Comments and processing instructions, in linear time.
-    for start, end in (("<!--", "-->"), ("<?", "?>")):
-        first, *rest = text.split(start)
-        text = first + "".join(part.partition(end)[2] for part in rest)
     # An ampersand that begins no entity.
     text = re.sub(r"&(?!\w+;|#)", "&amp;", text)
-    names = set(re.findall(r"[<\s]([A-Za-z_]\w{0,40}):", text)) - {"xml", "xmlns"}
-    prefixes = sorted(names)[:MOST_PREFIXES]
-    declared = " ".join(f'xmlns:{prefix}="urn:{prefix}"' for prefix in prefixes)
-    wrapper = _parse(f"<file {declared}>{text}</file>".encode(errors="replace"))
+    # The declaration may be in the wrong place, or name another encoding.
+    text = re.sub(r"<\?xml [^>]*>", "", text)
+    wrapper, errors = _parse(f"<file>{text}</file>".encode(errors="replace"), recover=True)
     root = wrapper.find("{*}robot")
     if root is None and len(wrapper):
         root = wrapper[0]
-    if root is None:
+    if root is None or errors - FAULTS:
         raise etree.XMLSyntaxError("no element", 0, 0, 0)
     wrapper.remove(root)
     root.tail = None

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 from tabulate import tabulate
 
-import batchpid.task_space as ts
 from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.arrays.elementwise import TURN, wrap
 from batchpid.errors import InvalidArgumentError
@@ -59,8 +58,8 @@ def unsettled_findings(rollout: Rollout, robot: Robot) -> Findings:
     of :data:`RULES`.
 
     Every finding has the envs and the time [s] from which the joint hardly moved in the first of
-    them, or at which that env failed. Only failures are found where setpoints are neither joint
-    positions nor poses of a tool, and no more than :data:`EXAMINED` envs are examined.
+    them, or at which that env failed. Only failures are found where setpoints are not joint
+    positions, and no more than :data:`EXAMINED` envs are examined.
     """
     if robot.joint_names != rollout.info.joint_names:
         problem = f"{robot.name!r} has other joints than the run of {rollout.info.robot!r}"
@@ -107,8 +106,6 @@ def _finding(
     if code not in OF_ENVS:
         name = run.robot.joint_names[joint]
         detail = f"{run.error[-1, first, joint]:.2g} {run.robot.units[joint]} remain"
-        if code == "slow" and run.lag[first, joint] > 0:
-            detail += f", {1000 * run.lag[first, joint]:.0f} ms behind the moving setpoint"
     for fault in run.info.faults:
         if run.failed[first] and fault.env == first:
             detail = f"{fault.joint}: {fault.cause}"
@@ -132,57 +129,17 @@ class _Run:
         self.tail = slice(-min(ticks, max(3, round(TAIL * ticks))), None)
         self.qpos = rollout.qpos.astype(np.float64)
         self.failed: Bool = np.asarray(~rollout.ok.all(0))[:, None]
-        self.out_of_reach: Bool = np.zeros_like(self.failed)
-        """Envs whose tool has no such pose within the limits (envs, 1)."""
-        self.goal = self._find_goal()
-        """Joint positions at the last setpoints, of a pose those nearest to the end; the end where
-        they are unknown.
-        """
+        self.goal: Float64 = self.qpos[-1]
+        """Joint positions at the last setpoints; the end where they are unknown."""
+        if self.info.sets_positions:
+            self.goal = robot.coupling.positions(rollout.setpoint[-1])
         self.error = joint_difference(robot, self.goal - self.qpos)
         """Last setpoint minus each position (ticks, envs, dof) [rad or m]."""
         self.band = np.maximum(SETTLING_SHARE * np.abs(self.error[0]), absolute_band(robot))
         """Half width of the settling band [rad or m]."""
-        outside = (np.abs(self.error[-1]) > self.band) | self.failed | self.out_of_reach
+        outside = (np.abs(self.error[-1]) > self.band) | self.failed
         self.unsettled: Bool = outside & robot.independent
-        """Joints that end outside their band, and all joints of envs that failed or cannot reach
-        the pose.
-        """
-
-    @cached_property
-    def lag(self) -> Float64:
-        """Time by which the joints follow setpoints that move until the end (envs, dof) [s], the mean
-        error by the mean speed; 0 for others.
-        """
-        lag = np.zeros(self.goal.shape)
-        setpoint = self.rollout.setpoint
-        if setpoint.shape != self.qpos.shape or self.info.control == "effort":
-            return lag
-        change = joint_difference(self.robot, np.diff(setpoint, axis=0)) / self.rollout.tick
-        error = joint_difference(self.robot, setpoint - self.qpos)[1:]
-        moves = change[self.tail].any(0)
-        np.divide(np.abs(error).sum(0), np.abs(change).sum(0), out=lag, where=moves)
-        return lag
-
-    def _find_goal(self) -> Float64:
-        command = self.info.own_command
-        end: Float64 = self.qpos[-1]
-        if command is None and self.info.control != "effort":
-            goal: Float64 = self.robot.coupling.positions(self.rollout.setpoint[-1])
-            return goal
-        if (
-            command is None
-            or command.size != 7
-            or self.info.tool is None
-            or not self.robot.fixed_base
-        ):
-            return end
-        pose = self.rollout.setpoint[-1, :, :7].copy()
-        pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
-        tree = self.robot.kinematic_tree()
-        start = np.nan_to_num(end)
-        solution = ts.inverse_kinematics(tree, self.info.tool, pose, start, on_failure="return")
-        self.out_of_reach = ~np.asarray(solution.success)[:, None]
-        return np.asarray(solution.qpos)
+        """Joints that end outside their band, and all joints of envs that failed."""
 
     @cached_property
     def limit(self) -> Float64:
@@ -310,7 +267,6 @@ def _is_blocked(run: _Run) -> Bool:
 RULES: dict[str, Callable[[_Run], Bool]] = {
     "failed": lambda run: run.failed,
     "out-of-limits": _is_beyond_limits,
-    "out-of-reach": lambda run: run.out_of_reach,
     "guard": lambda run: run.rollout.guarded[-1],
     "touching": lambda run: np.array(run.pressed)[:, None] != "",
     "effort-limit": _is_too_weak,
@@ -322,7 +278,7 @@ RULES: dict[str, Callable[[_Run], Bool]] = {
 """Every cause, a kind of finding, in the order in which they are tested and listed: whether the
 joints (envs, dof) have it, or the envs (envs, 1).
 """
-OF_ENVS = ("failed", "out-of-reach", "touching")
+OF_ENVS = ("failed", "touching")
 """Causes of whole envs, which name no joint."""
 
 

@@ -235,20 +235,6 @@ def _outside(plan: _Plan) -> Iterator[Finding]:
                 )
 
 
-def _without_range(plan: _Plan) -> Iterator[Finding]:
-    """Yield joints that cannot move, apart from those of which a repair says so."""
-    reported = {repair.joint for repair in plan.robot.repairs if repair.code == "limits"}
-    for joint in plan.robot.joints:
-        if joint.lower == joint.upper and not joint.continuous and joint.name not in reported:
-            yield Finding.of(
-                "limits",
-                text="lower and upper limit are equal: no motion",
-                remedy="give <limit lower= upper=>, or make it fixed",
-                joint=joint.name,
-                detail=f"[{joint.lower:g}, {joint.upper:g}]",
-            )
-
-
 def _weak(plan: _Plan) -> Iterator[Finding]:
     """Yield joints that cannot be held, or not be moved, in some poses."""
     robot = plan.robot
@@ -274,21 +260,6 @@ def _without_effort_limit(plan: _Plan) -> Iterator[Finding]:
             yield Finding.of(
                 "no-effort-limit", joint=joint.name, detail=f"{limit:.3g} {joint.effort_unit}"
             )
-
-
-def _wrong_turns(plan: _Plan) -> Iterator[Finding]:
-    """Yield joints whose errors wrap in the params, but not in the file, and the reverse."""
-    if plan.params is None:
-        return
-    wraps = np.zeros(plan.robot.dof, bool)
-    if plan.params.continuous is not None:
-        wraps |= np.asarray(plan.params.continuous).any(axis=0)
-    for joint, is_wrapped in zip(plan.robot.joints, wraps, strict=True):
-        if joint.continuous != is_wrapped:
-            detail = "in params: the short way round may exceed limits"
-            if joint.continuous:
-                detail = "in the file: the error jumps where qpos wraps"
-            yield Finding.of("continuous", joint=joint.name, detail=detail)
 
 
 def _unstable(plan: _Plan) -> Iterator[Finding]:
@@ -318,10 +289,8 @@ ODDITIES: tuple[Callable[[_Plan], Iterator[Finding]], ...] = (
     _changed_meshes,
     _touching,
     _outside,
-    _without_range,
     _weak,
     _without_effort_limit,
-    _wrong_turns,
     _unstable,
 )
 """Every oddity, in the order in which they are listed."""

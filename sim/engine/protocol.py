@@ -172,7 +172,7 @@ class EnginePack(SingleOwner, ABC):
 
     def _change_model(self, rows: Sequence[int]) -> None:
         """Update the masses of the robots ``rows`` in the model."""
-        if self._masses.added and "joint_model" in self.__dict__:
+        if self._masses.added:
             self.joint_model.vary(rows, self._masses.added)
 
     def _add_joints(self, actuators: Actuators | None) -> Float64:
@@ -337,7 +337,9 @@ class EnginePack(SingleOwner, ABC):
 
     @abstractmethod
     def write_drive_target(self, position: Rows, velocity: Rows | None = None) -> None:
-        """Set the drives' targets (M, dof): position [rad or m] and velocity [rad/s or m/s]."""
+        """Set the drives' targets (M, dof): position [rad or m] and velocity [rad/s or m/s], by
+        default 0.
+        """
 
     # Sim steps in native code, where they are native.
 

@@ -65,12 +65,8 @@ class MujocoSolver:
     """Relative improvement of the cost at which it ends."""
     elliptic: bool = True
     """Whether friction cones are elliptic, not pyramids, which are faster and slip a little."""
-    limit_time: float = 0.0
-    """Time constant of joint limits [s]; at least two sim steps, which are the hardest limits that
-    MuJoCo simulates. An MJCF file gives its own time constants, for contacts too.
-    """
     contact_time: float = 0.005
-    """Time constant of contacts [s], at least two sim steps."""
+    """Time constant of contacts [s], at least two sim steps; an MJCF file gives its own."""
 
 
 SOLVERS = {

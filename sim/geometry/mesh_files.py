@@ -1,6 +1,6 @@
 """Mesh files of a URDF: the search for them, their reading, and their content.
 
-trimesh reads every file. Engines get vertices.
+trimesh reads the files. Engines get vertices, and read no file themselves.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ def find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | N
     ``package://`` and ``model://`` paths are looked up in ``package_dirs``, in the folders above
     the URDF, and in those of AMENT_PREFIX_PATH and ROS_PACKAGE_PATH, with the name of the package
     and, in a folder that is the package under another name, without it. Other paths are relative to
-    the URDF's folder, or to one of these. The suffix may be in the other case, and the name percent-encoded.
+    the URDF's folder, or to one of these. The suffix may be in the other case, and the name
+    percent-encoded.
     """
     # As in xacro, and on Windows.
     slashes = name.strip().replace("\\", "/")

@@ -304,8 +304,8 @@ def draw_motors(
 
     With the estimate m and the root L of the covariance L L^T, a draw is m + L z with normal z,
     within the bounds of the unknowns. Effects outside of the region keep their values in
-    the file. Friction and damping are in addition to the robot's description. For
-    ``tune(robot, motors=...)`` or a Runner with as many envs.
+    the file. Friction and damping are in addition to the robot's description. They are for a Runner
+    with as many envs.
 
     Raises
     ------

@@ -4,10 +4,9 @@ of controllers in Python; and in programs of JAX.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import lru_cache, partial
 from itertools import groupby
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from typing import Any
 
 import numpy as np
@@ -76,13 +75,11 @@ class Executor:
         place = self._places.get(name)
         return None if place is None else self._states[place]
 
-    def change(self, name: str, function: Callable[[Any, Pytree], Pytree]) -> None:
-        """Replace the state of the stage ``name``, between sim steps, by ``function(stage, state)``,
-        a state with arrays of the same shapes.
-        """
+    def add_chunk(self, chunk: Float64, latency: Float64) -> None:
+        """Add a chunk (M, rows, dof) that is ``latency`` (M,) [s] old to the plan."""
         states = list(self._states)
-        place = self._places[name]
-        states[place] = function(self.setup.stages[place], states[place])
+        place = self._places["plan"]
+        states[place] = self.setup.stages[place].add(states[place], chunk, latency)
         self.write_state(tuple(states))
 
     def read_state(self) -> States:
@@ -234,7 +231,7 @@ class JAXExecutor(NumPyExecutor):
         super().__init__(setup, states)
         self._programs = list[tuple[slice, Any]]()
         first = 0
-        for calls_model, group in groupby(setup.stages, _calls_model):
+        for calls_model, group in groupby(setup.stages, attrgetter("calls_model")):
             part = running(group)
             program = None
             if not calls_model:
@@ -285,11 +282,6 @@ class JAXExecutor(NumPyExecutor):
 def _without(values: Values, *names: str) -> Values:
     nothing: dict[str, Any] = dict.fromkeys(names)
     return values._replace(**nothing)
-
-
-def _calls_model(stage: Any) -> bool:
-    calls_model: bool = stage.calls_model
-    return calls_model
 
 
 @lru_cache(maxsize=8)

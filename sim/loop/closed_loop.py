@@ -94,12 +94,27 @@ class ClosedLoop:
             control = control._replace(actuators=actuators)
         return replace(self, control=control, plant=plant or self.plant)
 
-    def init(self, qpos: Array = None, qvel: Array = None) -> LoopState:
+    def init(
+        self,
+        qpos: Array = None,
+        qvel: Array = None,
+        episode: Array = None,
+    ) -> LoopState:
         """Return the state of robots that start at ``qpos`` and ``qvel`` (dof,) or (envs, dof); by
         default at rest at the robot's start pose, in NumPy's arrays. For a loop in JAX, give one
-        of JAX.
+        of JAX. ``episode`` (envs,) numbers the episodes of the sensors' noise, by default 0.
         """
-        return self._started(qpos, qvel)
+        start = self.start if qpos is None else qpos
+        rest = np.zeros(1) if qvel is None else qvel
+        xp = namespace(start, rest)
+        control = self.control
+        shape = control.envs, control.coupling.leader.shape[0]
+        place, rate = (xp.broadcast_to(xp.asarray(rows, float), shape) for rows in (start, rest))
+        plant = self.plant.init(place, rate)
+        if episode is None:
+            episode = xp.zeros(control.envs, int)
+        values = self.values(plant, Command(None), Step(0, 1), episode)
+        return LoopState(plant, started(stages_of(control), values), episode)
 
     def reset(
         self, state: LoopState, qpos: Array = None, qvel: Array = None, mask: Array = None
@@ -113,23 +128,7 @@ class ClosedLoop:
             problem = f"is {mask.dtype} {mask.shape}, not bool ({self.control.envs},)"
             raise InvalidArgumentError("mask", problem, remedy="give one bool per env")
         start = xp.asarray(self.start if qpos is None else qpos)
-        return replace_envs(state, self._started(start, qvel, state.episode + 1), mask)
-
-    def _started(self, qpos: Array, qvel: Array, episode: Array = None) -> LoopState:
-        """Return the state of envs that start, in their ``episode`` (envs,); by default the
-        first.
-        """
-        start = self.start if qpos is None else qpos
-        rest = np.zeros(1) if qvel is None else qvel
-        xp = namespace(start, rest)
-        control = self.control
-        shape = control.envs, control.coupling.leader.shape[0]
-        place, rate = (xp.broadcast_to(xp.asarray(rows, float), shape) for rows in (start, rest))
-        plant = self.plant.init(place, rate)
-        if episode is None:
-            episode = xp.zeros(control.envs, int)
-        values = self.values(plant, Command(None), Step(0, 1), episode)
-        return LoopState(plant, started(stages_of(control), values), episode)
+        return replace_envs(state, self.init(start, qvel, state.episode + 1), mask)
 
     def step(
         self,
@@ -316,7 +315,7 @@ def _tree_plant(options: RunnerOptions, tree: RigidTree, control: Control) -> Tr
     ends = np.array([[joint.lower, joint.upper] for joint in joints])
     low, high = np.where(is_limited, ends.T, [[-np.inf], [np.inf]])
     matrix = mass_matrix(tree, np.zeros((1, tree.dof)))[0] + np.diag(inertia[0])
-    time = max(getattr(options.physics, "limit_time", 0.0), 2 * control.timestep)
+    time = 2 * control.timestep
     return TreePlant(
         tree,
         tree.bodies,

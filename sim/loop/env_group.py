@@ -138,7 +138,7 @@ class EnvGroup:
 
     def add_chunk(self, chunk: Float64, latency: Float64) -> None:
         """Add a chunk (M, rows, dof) that is ``latency`` (M,) [s] old to the plan."""
-        self._executor.change("plan", lambda stage, state: stage.add(state, chunk, latency))
+        self._executor.add_chunk(chunk, latency)
 
     def _write_joints(self, rows: list[int] | None = None) -> None:
         """Write the motors' armature, and their friction behind the gear, to the engine's joints, of

@@ -116,7 +116,7 @@ def control_of(
     described = known_joints(options.robot)
     turns = np.array([joint.continuous / TURN for joint in joints])
     modelled = np.array([joint.friction * share for joint in joints]) + described["coulomb"]
-    free = np.array([joint.name in (options.free_joints or ()) for joint in joints])
+    free = np.array([not joint.has_motor for joint in joints])
     modelled[free] = 0.0
     has_modelled = "friction" in compensated and options.sets_positions and modelled.any()
     armature = None

@@ -7,7 +7,6 @@ grouped.
 
 from __future__ import annotations
 
-import time
 import traceback
 from collections.abc import Callable
 from itertools import chain
@@ -27,8 +26,7 @@ from batchpid.sim.options.options import RunnerOptions
 
 
 class Failure(NamedTuple):
-    """Error of a loop during a request. Whole ticks before it are valid; the state of the loop
-    after it is undefined.
+    """Error of a loop during a request. The state of the loop after it is undefined.
 
     It does not depend on how envs are divided among workers: of several failures, the
     :func:`first` is reported.
@@ -38,8 +36,6 @@ class Failure(NamedTuple):
     """Sim step since the start of the runner; the first one of the tick if it is not known."""
     env: int
     """First env of the group that failed."""
-    ticks: int
-    """Ticks of the request that were completed before the error."""
     error: Exception
 
     def portable(self, worker: str) -> Failure:
@@ -57,7 +53,7 @@ class Failure(NamedTuple):
 
 def failed(error: Exception) -> Failure:
     """Return the failure of a request that has no sim steps."""
-    return Failure(0, 0, 0, error)
+    return Failure(0, 0, error)
 
 
 def first(failures: list[Failure]) -> Failure:
@@ -66,7 +62,6 @@ def first(failures: list[Failure]) -> Failure:
 
 
 JOINED: dict[str, Callable[[list[Any]], Any]] = {
-    "run": max,
     "read": join_rows,
     "snapshot": join_rows,
     "poses": lambda results: [*chain.from_iterable(results)],
@@ -140,15 +135,14 @@ class Loop:
         except Exception as error:
             return failed(error)
 
-    def run(self, ticks: int, substeps: int, given: tuple[bool, ...]) -> float | Failure:
-        """Run ``ticks`` of ``substeps`` sim steps under the commands in their arrays; return the
-        seconds it took, or a Failure if a group failed. The other groups complete the run, so that
-        the first failure does not depend on grouping.
+    def run(self, ticks: int, substeps: int, given: tuple[bool, ...]) -> Failure | None:
+        """Run ``ticks`` of ``substeps`` sim steps under the commands in their arrays; return a
+        Failure if a group failed. The other groups complete the run, so that the first failure does
+        not depend on grouping.
 
         ``given`` says which arrays of the commands are given
         (:attr:`batchpid.stages.values.Command.given`); the others are set to 0.
         """
-        began = time.perf_counter()
         if given != self._given:
             self._given = given
             # The caller writes only what is given, so zeros stay until that changes.
@@ -167,7 +161,7 @@ class Loop:
                     group.finish(ticks, substeps)
                 except Exception as error:  # of a controller, or of the engine
                     failures.append(self._failure(error, group, substeps))
-        return first(failures) if failures else time.perf_counter() - began
+        return first(failures) if failures else None
 
     def _failure(self, error: Exception, group: EnvGroup, substeps: int) -> Failure:
         """Return the failure of a group in a run of ticks of ``substeps``."""
@@ -176,7 +170,7 @@ class Loop:
         if isinstance(error, ControllerError):
             step = steps + error.step
             error = error.at(step, self._options.timestep)
-        return Failure(step, group.pack.first_env, group.tick, error)
+        return Failure(step, group.pack.first_env, error)
 
     def close(self) -> None:
         """Free the scenes."""

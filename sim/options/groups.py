@@ -305,9 +305,8 @@ class Controller(Protocol):
     effort of an env must depend on its own rows alone. It travels to the workers by cloudpickle,
     and may call NumPy or a jitted function.
 
-    A setpoint has a number for each joint, unless the controller has an attribute ``command``: a
-    :class:`batchpid.sim.CommandSpec`, or a sequence of names, such as ``("x", "y")``. Then it is
-    (envs, size).
+    A setpoint has a number for each joint, unless the controller has an attribute ``command``, a
+    :class:`batchpid.sim.CommandSpec`. Then it is (envs, size).
 
     A snapshot fits a controller of the same class, whose attribute ``version`` is the same where it
     has one.
@@ -394,10 +393,6 @@ class ControlOptions(OptionGroup):
     is not compensated. On a floating base the passive force is computed as if the base were fixed:
     the weight of the base on the legs depends on their contacts, and the law carries it.
     """
-    free_joints: Annotated[Sequence[str] | None, option("snapshot")] = None
-    """Joints without a motor, whose forces are not compensated; default those that no actuator of
-    an MJCF file moves. A joint whose params have the effort limit 0 gets no effort at all.
-    """
     actuators: Annotated[bp.Actuators | None, option("restored")] = None
     """Delays, limits, friction and errors of motors and sensors: :func:`batchpid.make_actuators`,
     of one row, or one row per env. None, the default, selects the robot's actuators; control
@@ -459,13 +454,8 @@ class ControlOptions(OptionGroup):
                 problem = f"'jax' needs JAX on the CPU, and JAX_PLATFORMS is {platforms!r}"
                 remedy = "add cpu to it, or use backend='numpy'"
                 raise InvalidArgumentError("backend", problem, remedy=remedy)
-        free = self.free_joints
-        if free is None:
-            free = [joint.name for joint in robot.joints if not joint.has_motor]
-        for name in names("free_joints", free):
-            choice("free_joints", name, robot.joint_names)
-        values = {"free_joints": tuple(free), "stages": fit_stages(self.stages)}
-        return self.changed(control=control, tool=link, **values)
+        stages = fit_stages(self.stages)
+        return self.changed(control=control, tool=link, stages=stages)
 
     @property
     def control_name(self) -> str:

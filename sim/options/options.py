@@ -288,7 +288,7 @@ class RunnerOptions(RunnerKeywords):
         if place == "recording":
             values["physics"] = str(self.physics)
             if self.randomization is not None:
-                values["randomization"] = self.randomization.to_dict()
+                values["randomization"] = repr(self.randomization)
         return values
 
     @cached_property

@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64, Rows
@@ -144,10 +144,6 @@ def fit_errors(
         axes.set_ylabel(units[joint], fontsize=SMALL)
         for label, errors, colour in (("before", before, SECOND[0]), ("after", after, FIRST[0])):
             axes.semilogy(time, errors[:, joint], color=colour, lw=0.8, label=label)
-        # Minor ticks and exponents as formulas take most of a second to lay out.
-        axes.yaxis.set_major_locator(LogLocator(numticks=5))
-        axes.yaxis.set_minor_locator(NullLocator())
-        axes.yaxis.set_major_formatter("{x:.0e}")
         if len(held_out):
             axes.axvspan(
                 held_out[0],

@@ -8,14 +8,14 @@ import hashlib
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from batchpid.arrays.array_types import Document, Float64, Rows
-from batchpid.checks import choice, flag, number, read_array
+from batchpid.arrays.array_types import Float64, Rows
+from batchpid.checks import choice, flag, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
 from batchpid.sim.description.merging import link_inertias
@@ -74,19 +74,6 @@ class Distribution(ABC):
         if self.operation == "scale":
             return nominal * drawn
         return drawn + np.zeros_like(nominal)
-
-    def to_dict(self) -> Document:
-        """Return it as plain values: ``{"uniform": [low, high], "operation": "scale"}``."""
-        # A choice has a tuple of values.
-        values: list[object] = []
-        document: Document = {self.kind: values}
-        for entry in fields(self):
-            value = getattr(self, entry.name)
-            if not entry.kw_only:
-                values += np.ravel(value).tolist()
-            elif value != entry.default:
-                document[entry.name] = value
-        return document
 
 
 @dataclass(frozen=True)
@@ -154,40 +141,15 @@ class Normal(Distribution):
         return np.clip(generator.normal(self.mean, self.std, size), *self.support)
 
 
-@dataclass(frozen=True)
-class Choice(Distribution):
-    """Choice among ``values``, with equal probabilities."""
-
-    values: Sequence[float]
-    kind = "choice"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        values = read_array("values", self.values)
-        if values.ndim != 1 or not values.size or not np.isfinite(values).all():
-            problem = "must be a list of numbers"
-            raise InvalidArgumentError("values", problem, value=self.values, remedy="give one")
-        vars(self).update(values=tuple(values.astype(float).tolist()))
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
-        return min(self.values), max(self.values)
-
-    def sample(self, generator: np.random.Generator, size: int) -> Float64:
-        """Return independent draws (size,)."""
-        return np.array(self.values)[generator.integers(len(self.values), size=size)]
-
-
 DISTRIBUTIONS: dict[str, type[Distribution]] = {
-    kind.kind: kind for kind in (Uniform, LogUniform, Normal, Choice)
+    kind.kind: kind for kind in (Uniform, LogUniform, Normal)
 }
 """Distributions by their name in a file."""
 
 
 def read_distribution(name: str, value: object) -> Distribution:
-    """Return the distribution of the field ``name`` that a file describes, as
-    :meth:`Distribution.to_dict` does.
+    """Return the distribution of the field ``name`` that a file describes, such as ``{"uniform":
+    [low, high], "operation": "scale"}``.
 
     Raises
     ------
@@ -206,8 +168,6 @@ def read_distribution(name: str, value: object) -> Distribution:
         if not isinstance(numbers, Sequence):
             problem = f"{kind} needs a list of numbers"
             break
-        if kind == Choice.kind:
-            numbers = [numbers]
         # Python names the argument that is missing, or one too many.
         try:
             with documents.named(name):

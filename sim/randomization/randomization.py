@@ -3,8 +3,8 @@
 Each env has a stream, by default its index, and counts its episodes. The draws of one field come
 from the counter-based generator Philox4x64 (J. K. Salmon et al., "Parallel random numbers: as easy
 as 1, 2, 3", SC 2011) with the key (seed, hash of the field's name) and a counter that begins at (0,
-0, episode, stream). So they depend on these alone, and not on other envs, fields or earlier
-episodes.
+push, episode, stream), with the number of earlier pushes in the episode. So they depend on these
+alone, and not on other envs, fields or earlier episodes.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Randomization:
     :class:`batchpid.sim.Runner`.
 
     A field is a distribution (:class:`batchpid.sim.Uniform`, :class:`batchpid.sim.LogUniform`,
-    :class:`batchpid.sim.Normal`, :class:`batchpid.sim.Choice`), drawn for each joint or link, or a
+    :class:`batchpid.sim.Normal`), drawn for each joint or link, or a
     mapping of the names of some joints or links to distributions.
 
     The controller knows the nominal robot: compensation and mass matrix do not change.
@@ -286,15 +286,10 @@ class Randomization:
     # -- files
     # ----------------------------------------------------------------------------------------------
 
-    def to_dict(self) -> Document:
-        """Return the fields that are drawn as plain values, for :meth:`from_dict`."""
-        document = _copied(vars(self), plain=True)
-        return {name: value for name, value in document.items() if value not in (None, {})}
-
     @classmethod
     def from_dict(cls, document: Mapping[str, object]) -> Randomization:
-        """Return the randomization of :meth:`to_dict`, or of a file: ``{"payload": {"uniform": [0,
-        0.5]}, ...}``.
+        """Return the randomization that a file describes: ``{"payload": {"uniform": [0, 0.5]},
+        ...}``.
 
         Raises
         ------
@@ -313,12 +308,10 @@ class Randomization:
         return cls(**values)
 
 
-def _copied(value: Any, plain: bool = False) -> Any:
-    """Return a copy of the mappings in ``value``, with distributions as ``plain`` values or not."""
+def _copied(value: Any) -> Any:
+    """Return a copy of the mappings in ``value``."""
     if isinstance(value, Mapping):
-        return {name: _copied(part, plain) for name, part in value.items()}
-    if plain and isinstance(value, Distribution):
-        return value.to_dict()
+        return {name: _copied(part) for name, part in value.items()}
     return value
 
 

@@ -163,7 +163,6 @@ READERS: dict[str, Callable[[Any], Any]] = {
     "faults": lambda faults: tuple([Fault(*fault) for fault in faults]),
     "draws": lambda draws: {name: np.array(rows, np.float64) for name, rows in draws.items()},
     "versions": dict,
-    "randomization": dict,
 }
 """Fields of :class:`RunInfo` that are JSON in a recording, and how they are read from it."""
 

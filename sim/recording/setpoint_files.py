@@ -53,11 +53,6 @@ class Setpoints(NamedTuple):
     """Sim steps of a tick."""
 
 
-def _quoted(name: str) -> str:
-    """Return a name in quotation marks, its own doubled."""
-    return '"' + name.replace('"', '""') + '"'
-
-
 def error(
     source: str,
     problem: str,
@@ -167,16 +162,8 @@ def setpoint_csv(robot: Robot, motion: Trajectory) -> str:
     ]
     rows = np.column_stack([motion.time - motion.time[0], motion.position, motion.velocity])
     text = io.StringIO()
-    # A name may hold separators and quotation marks.
-    header = [name if re.fullmatch(r"[\w.:/-]+", name) else _quoted(name) for name in names]
-    np.savetxt(
-        text,
-        rows,
-        "%.9g",
-        ",",
-        header=",".join(["time", *header]),
-        comments="",
-    )
+    csv.writer(text, lineterminator="\n").writerow(["time", *names])
+    np.savetxt(text, rows, "%.9g", ",")
     return text.getvalue()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -69,10 +68,7 @@ class Robot:
     actuators: bp.Actuators | None = None
 
     def __repr__(self) -> str:
-        joints = textwrap.shorten(", ".join(self.joint_names), 100, placeholder=" ...")
-        mass = f"{sum(body.mass for body in self.tables.bodies):.4g} kg"
-        head = f"Robot({self.name!r}, {self.dof} dof, {mass}, path={str(self.path)!r},"
-        return f"{head}\n  joints={joints})"
+        return f"Robot({self.name!r}, {self.dof} dof, path={str(self.path)!r})"
 
     @property
     def name(self) -> str:

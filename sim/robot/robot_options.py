@@ -183,7 +183,7 @@ def fit_guard(
     for name in _NO_LIMIT:
         if (leaf := getattr(limits, name)) is not None:
             free = leads | np.isinf(leaf)
-            remedy = "give the limits of its leader"
+            remedy = "limit its leader, or use robot.guard(...), which limits leaders alone"
             entries(name, leaf, free, "limits a follower", joint_names, remedy=remedy)
     return frozen(limits)
 

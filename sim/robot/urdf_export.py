@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from batchpid.arrays.array_types import Document, Float64
 from batchpid.errors import RobotError
 from batchpid.export.differences import Exported
-from batchpid.sim.description.tables import Body
+from batchpid.sim.description.tables import Body, Visual
 from batchpid.sim.findings import summary
 from batchpid.sim.geometry.shapes import MOMENTS, Shape
 from batchpid.sim.robot.robot import Robot
@@ -21,9 +21,9 @@ from batchpid.task_space.frames import to_rpy
 def to_urdf(robot: Robot) -> Exported:
     """Return the URDF of ``robot`` with its repairs, which need none again, and a list of them.
 
-    It holds what is simulated: links with inertias and shapes, and joints with limits, friction,
-    damping and mimics. Links that fixed joints connect stay apart. Paths of meshes are absolute.
-    Raises RobotError for meshes of an MJCF file.
+    It holds links with inertias, shapes and visuals, and joints with limits, friction, damping and
+    mimics. Links that fixed joints connect stay apart. Paths of meshes are absolute. Raises
+    RobotError for meshes of an MJCF file.
     """
     root = etree.Element("robot", name=robot.name)
     for body in robot.tables.bodies:
@@ -33,17 +33,19 @@ def to_urdf(robot: Robot) -> Exported:
             _add(inertial, "mass", value=body.mass)
             entries = body.inertia[np.triu_indices(3)]
             _add(inertial, "inertia", **dict(zip(MOMENTS, entries, strict=True)))
-        for shape in robot.tables.shapes_of(body.name):
-            if shape.vertices is not None:
-                problem = f"{robot.path}: a URDF has no place for the meshes of an MJCF file"
-                raise RobotError(f"{problem}; use to_mjcf, or batchpid export --to mjcf")
-            collision = _placed(link, "collision", shape.position, shape.wxyz)
-            _add(etree.SubElement(collision, "geometry"), shape.kind, **_sizes(shape))
+        solid = [Visual(shape) for shape in robot.tables.shapes_of(body.name)]
+        drawn = robot.tables.visuals.get(body.name, ())
+        for tag, visuals in (("collision", solid), ("visual", drawn)):
+            for shape, rgba, _problem in visuals:
+                if shape is not None:
+                    _write_shape(link, tag, shape, rgba)
     for body in robot.tables.bodies[1:]:
         _write_joint(root, body)
     differences = [sentence.partition(": ")[2] for sentence in summary(robot.repairs)]
     if robot.actuators is not None:
         differences.append("motors and sensors (actuators) are not in a URDF")
+    if root.find("joint/safety_controller") is not None:
+        differences.append("k_velocity of each <safety_controller> is 1")
     etree.indent(root)
     text = etree.tostring(root, encoding="unicode")
     return Exported(f'<?xml version="1.0"?>\n{text}\n', tuple(differences))
@@ -65,12 +67,30 @@ def _write_joint(root: etree._Element, body: Body) -> None:
         limits |= {"lower": joint.lower, "upper": joint.upper}
     _add(element, "limit", **limits)
     _add(element, "dynamics", damping=joint.damping, friction=joint.friction)
-    if joint.soft_lower < joint.soft_upper < math.inf:
+    if math.isfinite(joint.soft_upper - joint.soft_lower):
         soft = {"soft_lower_limit": joint.soft_lower, "soft_upper_limit": joint.soft_upper}
-        _add(element, "safety_controller", **soft)
+        _add(element, "safety_controller", k_velocity=1, **soft)
     if (mimic := joint.mimic) is not None:
         factors = {"multiplier": mimic.multiplier, "offset": mimic.offset}
         _add(element, "mimic", joint=mimic.joint, **factors)
+
+
+def _write_shape(
+    link: etree._Element,
+    tag: str,
+    shape: Shape,
+    rgba: tuple[float, ...] | None,
+) -> None:
+    """Add a ``<collision>`` or ``<visual>`` to a link. Raises RobotError for a mesh without file."""
+    if shape.vertices is not None:
+        problem = "a URDF has no place for the meshes of an MJCF file"
+        raise RobotError(f"{shape.owner}: {problem}; use to_mjcf, or batchpid export --to mjcf")
+    element = _placed(link, tag, shape.position, shape.wxyz)
+    _add(etree.SubElement(element, "geometry"), shape.kind, **_sizes(shape))
+    if rgba is not None:
+        # Materials of one name are one.
+        material = etree.SubElement(element, "material", name=str(rgba))
+        _add(material, "color", rgba=rgba)
 
 
 def _sizes(shape: Shape) -> Document:

@@ -55,8 +55,6 @@ class RunnerState(NamedTuple):
     """
     steps: int = 0
     steps_since_checkpoint: int = 0
-    work: tuple[tuple[float, ...], int] = ((), 1)
-    """Seconds of each worker in the last run, and the ticks of that run."""
     changes: Rows | None = None
     """Changes of each env since the last tick (envs,): :attr:`batchpid.sim.Rollout.changes`."""
 
@@ -147,7 +145,7 @@ def committed(options: RunnerOptions, state: RunnerState, outcome: Outcome) -> R
     if method == "run":
         return _after_run(options, state, outcome)
     if method == "reset":
-        return _after_reset(options, state, outcome)
+        return _after_reset(state, outcome.request)
     if method == "restore":
         return _after_restore(state, *arguments)
     if method == "set_params":
@@ -157,43 +155,38 @@ def committed(options: RunnerOptions, state: RunnerState, outcome: Outcome) -> R
     return state
 
 
-def _after_reset(options: RunnerOptions, state: RunnerState, outcome: Outcome) -> RunnerState:
-    mask, qpos, qvel, draws, _ = outcome.request.arguments
+def _after_reset(state: RunnerState, request: Request) -> RunnerState:
+    mask, qpos, qvel, draws, _ = request.arguments
     motion = state.motion
     if motion is not None:
         setpoint, rate = motion
         rate = np.where(mask[:, None], qvel, 0.0 if rate is None else rate)
         motion = np.where(mask[:, None], qpos, setpoint), rate
-    state = state._replace(fault_steps=np.where(mask, NO_STEP, state.fault_steps))
-    state = _with_faults(options, state, outcome.at(0))
     return state.changed(
         RESET,
         mask,
+        fault_steps=np.where(mask, NO_STEP, state.fault_steps),
         draws=draws,
         motion=motion,
     )
 
 
 def _after_run(options: RunnerOptions, state: RunnerState, outcome: Outcome) -> RunnerState:
-    setpoint, rate, *_ = outcome.request.command
+    request, arrays = outcome.request, outcome.arrays
+    setpoint, rate, *_ = request.command
     motion = state.motion
-    work = state.work
-    count = outcome.num_ticks
-    ok = outcome.arrays.observation.ok[:count]
+    ok = arrays.observation.ok[: request.ticks]
     if np.count_nonzero(ok) < ok.size:
-        for arrays in outcome.completed:
-            state = _with_faults(options, state, arrays)
-    if motion is not None and count:
-        motion = setpoint[count - 1], None if rate is None else rate[count - 1]
-    if outcome.failure is None:
-        work = tuple(outcome.results), count
-    steps = count * outcome.request.substeps
+        for tick in range(request.ticks):
+            state = _with_faults(options, state, arrays.at(tick))
+    if motion is not None:
+        motion = setpoint[-1], None if rate is None else rate[-1]
+    steps = request.ticks * request.substeps
     return state._replace(
         motion=motion,
         steps=state.steps + steps,
         steps_since_checkpoint=state.steps_since_checkpoint + steps,
-        work=work,
-        changes=None if count else state.changes,
+        changes=None,
     )
 
 

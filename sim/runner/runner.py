@@ -28,7 +28,7 @@ from batchpid.sim.diagnosis.loop_stability import StabilityCheck
 from batchpid.sim.findings import report_shortfalls
 from batchpid.sim.loop.arrays import Snapshot
 from batchpid.sim.loop.faults import Fault, FaultWarning
-from batchpid.sim.loop.group_control import describe, native_obstacle
+from batchpid.sim.loop.group_control import describe
 from batchpid.sim.options.options import (
     OPTIONS,
     RunnerKeywords,
@@ -82,7 +82,7 @@ class Runner(SingleOwner):
         link ``tool``, or a :class:`batchpid.sim.Controller`; forces that are compensated.
     timestep, substeps
         Time step of simulation and control [s]; sim steps of a tick.
-    free_joints, actuators, plan, guard, stages
+    actuators, plan, guard, stages
         Motors and sensors, default the robot's; plan of a slow policy; limits of setpoints; further
         stages of a sim step.
     engine, physics, collisions, ground, build
@@ -153,8 +153,6 @@ class Runner(SingleOwner):
     def __repr__(self) -> str:
         options = self.options
         state = "closed" if self.closed else f"at {self.time:g} s"
-        if options.stages and (reason := native_obstacle(options)):
-            state += f", law in NumPy or JAX ({reason})"
         return (
             f"Runner({self.robot.name}, {self.num_envs} envs, {options.workers} workers,"
             f" control {options.control_name!r}, {options.engine}, timestep {self.timestep:g} s,"
@@ -517,14 +515,6 @@ class Runner(SingleOwner):
         return self._state.steps * self.timestep
 
     @property
-    def work_seconds(self) -> NDArray[np.float64]:
-        """Seconds of work of each worker in the last tick; after a rollout, the mean over the ticks
-        of one request.
-        """
-        seconds, ticks = self._state.work
-        return np.array(seconds) / ticks
-
-    @property
     def recoveries(self) -> int:
         """Number of lost workers that were replaced."""
         return self._pool.recoveries
@@ -641,19 +631,16 @@ class Runner(SingleOwner):
         """
         call = self._call
         pool = self._pool
-        is_run = request.method == "run"
         self._prepare(request)
         # From here on Ctrl-C waits, so that workers and state change together or not at all.
         call.begin()
         try:
             call.waits = True
-            pool.begin(request)
-            outcome = pool.finish()
+            outcome = pool.run(request)
             call.waits = False
-            # Ticks before a failure count: the workers have run them.
-            if outcome.failure is None or is_run:
+            if outcome.failure is None:
                 self._state = committed(self.options, self._state, outcome)
-            if outcome.failure is not None and request.changes_loop:
+            elif request.changes_loop:
                 self._fail(outcome.failure.error)
         except BaseException as error:
             self._fail(error)

@@ -100,7 +100,7 @@ class GainCandidates:
     gains.
 
     Each env runs one move of one candidate: all moves as steps, then the half whose smooth motions
-    are the shortest. Row k of ``motors`` is for move k, modulo their number. Candidates have
+    are the shortest. Candidates have
     ``headroom``, a share of the effort limits. The worst move counts unless robots are ``drawn``.
     """
 
@@ -113,12 +113,10 @@ class GainCandidates:
         *,
         headroom: float,
         drawn: bool,
-        motors: bp.Actuators | None = None,
     ) -> None:
         self.robot = robot
         self.seconds = seconds
         self.headroom = headroom
-        self.motors = motors
         self.designed = robot.designed(gain_units)
         self._drawn = drawn
         # Figures of the moves as steps.
@@ -144,8 +142,6 @@ class GainCandidates:
     def runner(self, count: int, options: Document) -> Runner:
         """Return a runner for ``count`` candidates."""
         rows = np.tile(self._rows, count)
-        if self.motors is not None:
-            options = options | {"actuators": self.motors.for_envs(rows % self.motors.num_envs)}
         return Runner(self.robot, len(rows), **options)
 
     def designs(self) -> Float64:

@@ -371,7 +371,7 @@ def compare(
     Parameters
     ----------
     gains
-        Sets of gains: tuned, designed, sapien-tutorial, mjcf, drive, drive:STIFFNESS,DAMPING,
+        Sets of gains: tuned, designed, sapien-tutorial, mjcf, drive,
         params files (.yaml or .json) that `batchpid tune` or batchpid.save_params wrote. Default:
         tuned, sapien-tutorial and drive for a bundled robot, else designed and drive.
     moves

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,6 +13,9 @@ from batchpid.sim.diagnosis.causes import table
 from batchpid.sim.options.groups import ControlMode
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import tuned_file
+
+DRIVE = (20.0, 5.0)
+"""Stiffness [N m/rad] and damping [N m s/rad] of the drive in SAPIEN's tutorial."""
 
 
 class GainSet(NamedTuple):
@@ -30,8 +32,8 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
 
     "tuned" gains ship with the robot, "designed" is :meth:`batchpid.sim.Robot.designed`, "sapien-tutorial"
     are the gains in SAPIEN's tutorial, for a bundled robot, "mjcf" is
-    :meth:`batchpid.sim.Robot.mjcf_gains`; "drive" or "drive:STIFFNESS,DAMPING" is the engine's
-    internal drive. Other names are params files.
+    :meth:`batchpid.sim.Robot.mjcf_gains`; "drive" is the engine's internal drive with the stiffness and
+    damping of :data:`DRIVE`. Other names are params files.
 
     Raises
     ------
@@ -48,22 +50,9 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
     }
     if name in named:
         return GainSet(name, named[name]())
-    kind, _, figures = name.partition(":")
-    if kind == "drive":
-        try:
-            stiffness, damping = map(float, (figures or "20,5").split(","))
-        except ValueError:
-            stiffness = damping = math.nan
-        if not (0 <= stiffness < math.inf and 0 <= damping < math.inf):
-            problem = "is no drive of finite stiffness and damping, 0 or more"
-            remedy = "write drive:STIFFNESS,DAMPING, e.g. drive:20,5"
-            raise InvalidArgumentError("gains", problem, value=name, remedy=remedy)
-        params = robot.params(
-            kp=stiffness,
-            ki=0.0,
-            kd=damping,
-            effort_limit=None,
-        )
+    if name == "drive":
+        stiffness, damping = DRIVE
+        params = robot.params(kp=stiffness, ki=0.0, kd=damping, effort_limit=None)
         return GainSet(f"drive ({stiffness:g}, {damping:g})", params, "drive")
     path = Path(name)
     if not path.is_file():

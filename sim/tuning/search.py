@@ -118,7 +118,6 @@ def tune(
     seconds: float = 1.5,
     gain_units: Literal["mass_matrix", "effort"] = "mass_matrix",
     randomization: Randomization | None = None,
-    motors: bp.Actuators | None = None,
     engine: EngineName = DEFAULT_ENGINE,
     workers: int | None = None,
     progress: Progress[Any] | None = None,
@@ -143,11 +142,6 @@ def tune(
     randomization
         Draw the robot of each move, the same for all candidates: a YAML file
         (docs/randomization.md), e.g. `payload: {uniform: [0, 0.5]}`.
-    motors
-        Actuators of which one is the true one, a row each, such as the draws of
-        :func:`batchpid.sim.identification.draw_motors`: every move is made with another row, the
-        same for all candidates, and the worst move counts as much as the mean. The controller knows
-        the robot's own actuators.
     engine
         Physics engine.
     workers
@@ -175,14 +169,11 @@ def tune(
         problem = "is chosen by the search, which is for explicit gains"
         remedy = "bp.design_gains makes implicit gains"
         raise InvalidArgumentError(name, problem, remedy=remedy)
-    if motors is not None and runner_options.get("actuators") is not None:
-        remedy = "leave it out: the control knows the actuators of the robot"
-        raise InvalidArgumentError("actuators", "cannot be combined with motors", remedy=remedy)
     # Options of all rollouts; the search adds fast ones where moves are free of contact.
     scene: Document = {"engine": engine, "workers": workers, **runner_options}
     options: Document = {"substeps": EVALUATION_SUBSTEPS, **scene}
 
-    differs = randomization is not None or robot.actuators is not None or motors is not None
+    differs = randomization is not None or robot.actuators is not None
     moves = seeded_moves(robot, SEARCH_MOVES, seed)
     unseen = random_moves(robot, FINAL_MOVES, seed + FINAL_SEED)
     fast = Document()
@@ -196,8 +187,7 @@ def tune(
             moves,
             seconds,
             headroom=headroom,
-            drawn=differs and motors is None,
-            motors=motors,
+            drawn=differs,
         )
 
     # The designed gains are the first candidate, so that every cost has a reference.
@@ -240,7 +230,7 @@ def tune(
         "seconds": seconds,
         "gain_units": gain_units,
         "moves": list(moves.names),
-        "randomization": None if randomization is None else randomization.to_dict(),
+        "randomization": _plain(randomization),
         "engine": engine,
         **{name: _plain(value) for name, value in runner_options.items()},
         "versions": package_versions(("batchpid", engine, "numpy", "cmaes")),

@@ -4,7 +4,6 @@ time, and the gate that only the owner of its address passes.
 
 from __future__ import annotations
 
-import errno
 import io
 import math
 import re
@@ -46,7 +45,7 @@ SERIES = (
 
 
 class View(AbstractContextManager["View"]):
-    """Page that shows ``data``, served on this machine at ``port``, or at a free port, until
+    """Page that shows ``data``, served on this machine at ``port``, 0 for a free one, until
     :meth:`close`.
 
     Only somebody who knows :attr:`url` can open it.
@@ -235,17 +234,12 @@ class View(AbstractContextManager["View"]):
 
 
 class Gate:
-    """Socket at ``port``, or at a free port if that is in use, and the rule for requests to it: a
-    request needs this server as its Host, no other page as its Origin, and the token.
+    """Socket at ``port``, 0 for a free one, and the rule for requests to it: a request needs this
+    server as its Host, no other page as its Origin, and the token.
     """
 
     def __init__(self, port: int) -> None:
-        try:
-            self.socket = socket.create_server((HOST, port))
-        except OSError as error:
-            if error.errno != errno.EADDRINUSE:
-                raise
-            self.socket = socket.create_server((HOST, 0))
+        self.socket = socket.create_server((HOST, port))
         self.port: int = self.socket.getsockname()[1]
         self.token = secrets.token_urlsafe(16)
 

@@ -20,6 +20,9 @@ from batchpid.sim.runner.runner import Runner
 from batchpid.sim.signals import Observation
 from batchpid.sim.view.scene import MAX_ROBOTS
 
+FRAME = 1 / 30
+"""Time from frame to frame [s]."""
+
 
 class LiveSimulation:
     """``num_envs`` robots under the PID, on their way to the robot's target, or to the setpoints of
@@ -45,7 +48,7 @@ class LiveSimulation:
         robot: Robot,
         num_envs: int,
         *,
-        period: float = 1 / 30,
+        period: float = FRAME,
         spread: float = 0.2,
         **options: Any,
     ) -> None:
@@ -93,7 +96,7 @@ class LiveSimulation:
 class Playback:
     """Recorded run, from the first row to the last and then again.
 
-    ``robot`` is by default :func:`recorded_robot`. Frames are ``period`` [s] apart, or a tick of
+    ``robot`` is by default :func:`recorded_robot`. Frames are :data:`FRAME` apart, or a tick of
     the run.
 
     Raises
@@ -103,9 +106,7 @@ class Playback:
         robot; or the recording holds no robot.
     """
 
-    def __init__(
-        self, rollout: Rollout, robot: Robot | None = None, *, period: float = 1 / 30
-    ) -> None:
+    def __init__(self, rollout: Rollout, robot: Robot | None = None) -> None:
         rollout.check_ticks()
         robot = recorded_robot(rollout) if robot is None else robot
         joints = rollout.qpos.shape[2]
@@ -115,15 +116,12 @@ class Playback:
             raise InvalidArgumentError("rollout", problem, remedy=remedy)
         self.robot = robot
         self.num_envs = integer("num_envs", rollout.num_envs, 1, MAX_ROBOTS)
-        ground = rollout.info.ground
-        if ground is None:
-            ground = robot.has_ground
-        self.ground = ground
+        self.ground = bool(rollout.info.ground)
         """True if the run had a ground at height 0."""
         self._rollout = rollout
         self.duration = float(rollout.time[-1] - rollout.time[0])
         """Time from the first row to the last [s]."""
-        self.period = max(period, rollout.tick)
+        self.period = max(FRAME, rollout.tick)
         self.time = 0.0
         """Time since the first row [s]."""
 

@@ -59,11 +59,11 @@ class Node:
                 error = WorkerLost(str(error.__cause__))
             return failed(error).portable("node"), None
         self._pool.replay.start_from(None)
-        arrays = None
-        if outcome.num_ticks:
-            arrays = self._pool.arrays.at(slice(outcome.num_ticks))
         if outcome.failure is not None:
-            return outcome.failure, arrays
+            return outcome.failure, None
+        arrays = None
+        if request.ticks:
+            arrays = self._pool.arrays.at(slice(request.ticks))
         return outcome.result, arrays
 
 
@@ -148,10 +148,8 @@ class NodeWorker(Worker):
         exceptions = self._cluster.ray.exceptions
         try:
             result, arrays = self._cluster.ray.get(self._call, timeout=self._seconds)
-        except exceptions.GetTimeoutError as error:
-            raise self._lost("is stuck: no answer in time") from error
-        except exceptions.RayError as error:
-            raise self._lost(f"died ({type(error).__name__}: {error})") from error
+        except exceptions.RayError as error:  # one of them is that the time is up
+            raise self._lost(f"is lost ({type(error).__name__}: {error})") from error
         if arrays is not None:
             ticks = slice(len(arrays.observation.ok))
             part = self._shared.arrays.at((ticks, self.envs))

@@ -11,7 +11,6 @@ signal handler, leaves the pool in an invalid state, and its owner must close it
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -53,26 +52,12 @@ class Outcome(NamedTuple):
     """Outcome of a request in all workers."""
 
     request: Request
-    results: list[Any]
-    """Result of each worker; None of one that failed."""
+    result: Any
+    """Result for all envs; None after a failure."""
     failure: Failure | None
     """First failure of a loop."""
-    num_ticks: int
-    """Ticks with observations that all envs completed."""
     arrays: Arrays
     """Input and output of all ticks."""
-    at: Callable[[int], Arrays]
-    """Function that returns views of the arrays at a tick."""
-
-    @property
-    def result(self) -> Any:
-        """Result for all envs."""
-        return joined(self.request.method, self.results)
-
-    @property
-    def completed(self) -> list[Arrays]:
-        """Ticks that all envs completed."""
-        return [self.at(tick) for tick in range(self.num_ticks)]
 
 
 class Replay:
@@ -176,7 +161,6 @@ class WorkerPool(SingleOwner):
         self._at = cache(self.arrays.at)
         self.present = self._at(0)
         """Tick with the present observation."""
-        self._request = BUILD
         row = 3 * options.command.size + options.robot.dof
         self.replay = Replay(MOST_BYTES // (row * num_envs * np.dtype(float).itemsize))
         """Requests for the replacement of a lost worker."""
@@ -212,61 +196,33 @@ class WorkerPool(SingleOwner):
         ClosedError
             The pool was closed meanwhile.
         """
-        self.begin(request)
-        return self.finish()
-
-    def begin(self, request: Request) -> None:
-        """Send every worker its part of ``request``; :meth:`finish` waits for the end. Raises as
-        :meth:`run`.
-
-        A loop in this process executes it at once.
-        """
         if self.closed:
             raise ClosedError(_CLOSED)
-        self._request = request
+        results = []
         try:
             request.write(self.arrays, slice(None))
             for worker in self.workers:
                 worker.send(request)
-        except Exception as error:
-            self._raise_if_closed(error)
-            raise
-
-    def finish(self) -> Outcome:
-        """Wait until every worker has executed the request, and return the outcome. Raises as
-        :meth:`run`.
-
-        It waits for one worker after another: to wake up for the first would take the core of one
-        that still runs.
-        """
-        request = self._request
-        results = []
-        failures = []
-        try:
+            # One worker after another: to wake up for the first would take the core of one that
+            # still runs.
             for worker in self.workers:
                 try:
-                    result = worker.receive()
+                    results.append(worker.receive())
                 except WorkerLost as error:
-                    result = self._replace(worker, error)
-                if isinstance(result, Failure):
-                    failures.append(result)
-                    result = None
-                results.append(result)
+                    results.append(self._replace(worker, request, error))
         except Exception as error:
             self._raise_if_closed(error)
             raise
         if self.closed:
             raise ClosedError(_CLOSED)
-        failure, count = None, request.ticks
+        failures = [result for result in results if isinstance(result, Failure)]
         if failures:
-            failure = first(failures)
-            # Ticks that every env completed before the error are kept.
-            count = failure.ticks if request.method == "run" else 0
-        elif request.changes_loop:
+            return Outcome(request, None, first(failures), self.arrays)
+        if request.changes_loop:
             self.replay.append(request)
-        if count:
-            self.present = self._at(count - 1)
-        return Outcome(request, results, failure, count, self.arrays, self._at)
+        if request.ticks:
+            self.present = self._at(request.ticks - 1)
+        return Outcome(request, joined(request.method, results), None, self.arrays)
 
     def close(self) -> None:
         """End all workers at once. May be called again, as after an interrupt."""
@@ -279,16 +235,12 @@ class WorkerPool(SingleOwner):
             vars(self).pop(name, None)
         self._shared.close()
 
-    def __del__(self) -> None:
-        if hasattr(self, "workers"):
-            self.close()
-
     def _raise_if_closed(self, error: Exception) -> None:
         if self.closed:
             raise ClosedError(_CLOSED) from error
 
-    def _replace(self, worker: Worker, loss: WorkerLost) -> Any:
-        """Replace a lost worker; return the result of the new one for the present request."""
+    def _replace(self, worker: Worker, request: Request, loss: WorkerLost) -> Any:
+        """Replace a lost worker; return the result of the new one for ``request``."""
         if not self.replay.requests:
             problem = "its commands since the last checkpoint are too many to be replayed"
             remedy = "reset all envs, or take a runner.snapshot(), now and then"
@@ -300,9 +252,9 @@ class WorkerPool(SingleOwner):
             try:
                 worker.close()
                 worker.open()
-                for request in (*self.replay.requests, self._request):
-                    request.write(self.arrays, worker.envs)
-                    worker.send(request)
+                for each in (*self.replay.requests, request):
+                    each.write(self.arrays, worker.envs)
+                    worker.send(each)
                     result = worker.receive()
                     if isinstance(result, Failure):  # of a ``build`` that works no more
                         return result

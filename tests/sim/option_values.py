@@ -117,7 +117,6 @@ VALUES = {
     "randomization": [Randomization(payload=Uniform(0, 1)), Randomization(payload=Uniform(0, 2))],
     "guard": [bp.make_guard(2, rate=0.5), bp.make_guard(2, rate=0.2)],
     "plan": [bp.make_plan(2, period=0.02, horizon=4), bp.make_plan(2, period=0.03, horizon=4)],
-    "free_joints": [["elbow"], ["shoulder", "elbow"]],
     "stages": [[Thermal(2.0, 0.02)], [Thermal(3.0, 0.02)]],
     "contacts": [["hand"], ["arm", "hand"]],
     "wrenches": [["hand"], ["arm"]],

@@ -71,7 +71,7 @@ KINDS = {
     ),
     "drawn.yaml": Kind(
         lambda path: path.write_text(yaml.safe_dump(DRAWN)),
-        lambda path: load_randomization(path, ARM).to_dict(),
+        lambda path: repr(load_randomization(path, ARM)),
     ),
     "log.csv": Kind(write_table, lambda path: read_logs(ARM, [path])),
     "motion.csv": Kind(

@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
 from tiny_urdf import LIMIT, gripper, joint, link, robot, write  # noqa: E402
 
 from batchpid.errors import InvalidArgumentError  # noqa: E402
-from batchpid.sim import FaultWarning, Randomization, Robot, Uniform  # noqa: E402
+from batchpid.sim import CommandSpec, FaultWarning, Randomization, Robot, Uniform  # noqa: E402
 from batchpid.sim.gym import ReachVectorEnv  # noqa: E402
 
 ID = "batchpid.sim.gym:batchpid/Reach-v0"
@@ -232,7 +232,7 @@ def test_a_joint_that_cannot_move_does_not_enter_the_reward(carousel):
 class Hold:
     """Controller whose setpoints are not of joints."""
 
-    command = ("x", "z")
+    command = CommandSpec(("x", "z"))
 
     def init(self, robot, num_envs, timestep):
         return None

@@ -9,7 +9,6 @@ from robots import load_bundled
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import (
-    Choice,
     LogUniform,
     Normal,
     Randomization,
@@ -30,11 +29,11 @@ EVERYTHING = Randomization(
     qvel=Normal(0, 0.1),
     params={
         "kp": LogUniform(0.5, 2, operation="scale"),
-        "kd": Choice([1.0, 1.1], operation="scale", shared=True),
+        "kd": Uniform(1.0, 1.1, operation="scale", shared=True),
     },
     actuators={
         "command_delay": Uniform(0, 0.003, shared=True),
-        "sensor_delay": Choice([0.0, 0.001]),
+        "sensor_delay": Uniform(0.0, 0.001),
         "coulomb": Uniform(0, 0.1),
         "static": Uniform(0, 0.4),
         "position_resolution": Uniform(0, 1e-5),

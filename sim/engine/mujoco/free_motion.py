@@ -33,6 +33,8 @@ Arrays = dict[str, NDArray[Any]]
 _NO_CONTACT = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 _NEVER = 1 << 30
 """Age without a proof: NEVER in ``clearance.h``."""
+_FLAGS = 0x5AA55AA5
+"""Value of ``opt.disableflags`` by which its place in ``mjModel`` is found."""
 _POINTERS = "body_geomnum", "body_contype", "body_conaffinity"
 _BEGINNING = 4096
 """Number of bytes at the start of ``mjModel`` that are searched for its options; ``mjModel`` is
@@ -154,7 +156,7 @@ def _arms(robot: RobotMj, pairs: NDArray[np.intp]) -> tuple[Float64, Float64]:
             across = np.linalg.norm(np.cross(points[:, :3], axes[at]), axis=1)
             arms[at] = (across + points[:, 3]).max(initial=0.0)
         add(data.xpos[body], reach, model.body_parentid[body])
-    floats = robot.base is not None
+    floats = len(model.jnt_type) > dof
     moved = np.zeros((model.nbody, dof + 2 * floats), bool)
     for body in range(1, model.nbody):
         # What moves a body moves its children.
@@ -166,29 +168,29 @@ def _arms(robot: RobotMj, pairs: NDArray[np.intp]) -> tuple[Float64, Float64]:
     return np.where(differs, arms[: moved.shape[1]], 0.0), travel
 
 
+def _offset(address: int, size: int, value: int, kind: type[np.generic]) -> int | None:
+    """Return the offset [bytes] of the only ``value`` in ``size`` bytes of memory; None if it is
+    ambiguous.
+    """
+    memory = np.frombuffer(ctypes.string_at(address, size), kind)
+    indices = np.flatnonzero(memory == value)
+    return int(indices[0]) * memory.itemsize if len(indices) == 1 else None
+
+
 @cache
 def places() -> tuple[int, ...] | None:
     """Return the offsets of ``opt.disableflags`` and of the pointers :data:`_POINTERS` in
-    ``mjModel`` [bytes].
-
-    The flags are found by a change of one of them, the pointers by their values. None if one is
-    ambiguous.
+    ``mjModel`` [bytes], found by their values. None if one is ambiguous.
     """
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
-    before = ctypes.string_at(model._address, _BEGINNING)
-    # One bit differs between the two copies of the model's beginning.
-    model.opt.disableflags ^= _NO_CONTACT
-    after = ctypes.string_at(model._address, _BEGINNING)
-    flags = [place for place in range(_BEGINNING) if before[place] != after[place]]
-    addresses = [getattr(model, name).ctypes.data for name in _POINTERS]
+    model.opt.disableflags = _FLAGS
+    values = [getattr(model, name).ctypes.data for name in _POINTERS]
+    address = model._address
     offsets = [
-        (8 * np.flatnonzero(np.frombuffer(after, np.uint64) == address)).tolist()
-        for address in addresses
+        _offset(address, _BEGINNING, _FLAGS, np.int32),
+        *(_offset(address, _BEGINNING, value, np.uint64) for value in values),
     ]
-    is_clear = len(flags) == 1 and flags[0] % 4 == 0 and all(len(words) == 1 for words in offsets)
-    if is_clear:
-        return (flags[0], *(words[0] for words in offsets))
-    return None
+    return None if None in offsets else tuple(filter(None, offsets))
 
 
 class GroupClearance:
@@ -212,7 +214,7 @@ class GroupClearance:
         robots = len(data)
         pairs = len(tables["pairs"])
         bodies = models[0].nbody
-        floats = bool((models[0].jnt_type == mujoco.mjtJoint.mjJNT_FREE).any())
+        floats = models[0].njnt > dof
         blocks, ways = -(-robots // WIDTH), dof + 2 * floats
         arrays = tables | {
             # Native code reads the places of shapes where MuJoCo writes them.
@@ -273,8 +275,8 @@ def place_of_contacts() -> int | None:
     # The number lies between these two arrays of the structure.
     start = data.solver_fwdinv.ctypes.data
     size = data.energy.ctypes.data - start
-    places = np.flatnonzero(np.frombuffer(ctypes.string_at(start, size), np.int32) == _COUNT)
-    return start - data._address + 4 * int(places[0]) if len(places) == 1 else None
+    offset = _offset(start, size, _COUNT, np.int32)
+    return None if offset is None else start - data._address + offset
 
 
 class FreeMotions:
@@ -367,13 +369,10 @@ class FreeMotions:
         is_touching = self.contact == number("Contact", "SOME")
         self.contact[is_touching] = number("Contact", "UNKNOWN")
 
-    def read(self) -> tuple[Float64, Float64, Float64]:
-        """Return positions, velocities and last accelerations (M, dof)."""
-        qpos, qvel, acceleration = (
-            np.array(array.swapaxes(1, 2).reshape(-1, array.shape[1])[: self.size])
-            for array in self._states
-        )
-        return qpos, qvel, acceleration
+    def read(self, state: int) -> Float64:
+        """Return positions, velocities or last accelerations (M, dof): ``state`` 0, 1, 2."""
+        array = self._states[state]
+        return np.array(array.swapaxes(1, 2).reshape(-1, array.shape[1])[: self.size])
 
     def write(self, rows: Sequence[int] | slice, *states: Rows | float) -> None:
         """Set positions, velocities and last accelerations (len(rows), dof) of robots ``rows``."""

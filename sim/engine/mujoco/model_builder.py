@@ -78,8 +78,8 @@ class RobotMj:
     """Frames of simulated links in their bodies, in an MJCF file; of other links the frames are
     the same.
     """
-    base: tuple[int, int] | None = None
-    """Index of a floating base in MuJoCo's qpos and qvel; None on a fixed one."""
+    base: tuple[int, int] = (0, 0)
+    """Index of a floating base in MuJoCo's qpos and qvel."""
 
 
 @lru_cache(maxsize=8)
@@ -102,13 +102,10 @@ def robot_model(spec: SceneSpec) -> RobotMj:
         raise _refusal(error) from error
     bodies = {link: model.body(name).id for link, name in names.items()}
     for row in spec.simulated.bodies:  # the compiler refuses some inertias that both simulate
-        moments, _ = principal_inertia(row.spatial_inertia)
-        model.body_inertia[bodies[row.name]] = moments
+        model.body_inertia[bodies[row.name]], _ = row.spatial_inertia.principal
     mujoco.mj_setConst(model, mujoco.MjData(model))
     _choose_solver(model)
-    return RobotMj(
-        model, spec.joints, *_places(model, spec), bodies, base=None if spec.fixed_base else (0, 0)
-    )
+    return RobotMj(model, spec.joints, *_places(model, spec), bodies)
 
 
 def _places(model: MjModel, spec: SceneSpec) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -151,7 +148,7 @@ def _file_model(spec: SceneSpec, file: MjcfFile) -> RobotMj:
     model.dof_frictionloss[qvel] = 0.0
     model.dof_damping[qvel] = np.maximum(damping + [joint.damping for joint in spec.joints], 0.0)
     mujoco.mj_setConst(model, mujoco.MjData(model))
-    base = None
+    base = 0, 0
     if root:
         joint = model.joint(model.body(root).jntadr[0])
         base = int(joint.qposadr[0]), int(joint.dofadr[0])
@@ -201,9 +198,9 @@ def principal_inertia(inertia: SpatialInertia) -> tuple[Float64, Float64]:
     """Return principal moments (3,) [kg m^2] and the rotation of the principal axes (4,), in the
     axes of the body.
     """
-    moments, axes = np.linalg.eigh(inertia.tensor)
+    moments, axes = inertia.principal
     wxyz = np.empty(4)
-    mujoco.mju_mat2Quat(wxyz, (axes * np.linalg.det(axes)).ravel())  # a rotation, not a reflection
+    mujoco.mju_mat2Quat(wxyz, axes.ravel())
     return moments, wxyz
 
 
@@ -215,10 +212,8 @@ def _set_options(scene: MjSpec, spec: SceneSpec) -> None:
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     option.iterations = solver.iterations
     option.tolerance = solver.tolerance
-    if solver.elliptic:
-        option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    else:
-        option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    cones = mujoco.mjtCone
+    option.cone = cones.mjCONE_ELLIPTIC if solver.elliptic else cones.mjCONE_PYRAMIDAL
     # A diverged env must stay visible: the loop suspends or resets it, and reports it.
     option.disableflags |= off.mjDSBL_AUTORESET | off.mjDSBL_ACTUATION
 
@@ -275,7 +270,7 @@ def _add_joint(body: Any, joint: Joint, spec: SceneSpec) -> None:
         axis=np.array(joint.axis) / np.linalg.norm(joint.axis),
         limited=not joint.continuous and bool(np.isfinite(ends).any()),
         range=[lower, max(upper, lower + _NARROWEST)],
-        solref_limit=[max(spec.physics.limit_time, 2 * spec.timestep), 1.0],
+        solref_limit=[2 * spec.timestep, 1.0],  # the hardest that MuJoCo simulates
         solimp_limit=_HARD,
         armature=spec.timestep * joint.damping,
     )

@@ -6,7 +6,7 @@ Longer than 350 lines because that is the whole interface between loop and engin
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
@@ -61,7 +61,7 @@ class MujocoPack(EnginePack):
         else:
             links = *(spec.contacts or ()), *(spec.wrenches or ()), spec.carrier
             check_links(spec, spec.mjcf, filter(None, links))
-        self._stiffness = self._rate_gain = self._target_rate = np.zeros((1, self.dof))
+        self._stiffness = self._rate_gain = np.zeros((1, self.dof))
         self._robot = robot = robot_model(spec)
         if workspace is None:
             workspace = {}
@@ -73,22 +73,15 @@ class MujocoPack(EnginePack):
         self.models, self.rows = [self._pool.model] * self.size, self._pool.initial(self.size)
         self._at, self._moves = robot.qpos, robot.qvel
         self._free: FreeMotions | None = None
-        if self.steps_natively and self._moves_freely:
+        # A robot that touches nothing is then a tree of rigid bodies, under efforts alone.
+        is_tree = spec.fixed_base and spec.mjcf is None and self.dof > 0
+        if self.steps_natively and is_tree and place_of_contacts() is not None:
             self._free = FreeMotions(robot, self.joint_model, self._sensed)
         self._change_world(range(self.size))
         self._change_masses(range(self.size))
         self._update(range(self.size))
         if variation is not None:
             self.write_joints(None)
-
-    @property
-    def _moves_freely(self) -> bool:
-        """Whether a robot that touches nothing is a tree of rigid bodies on a fixed base, under
-        efforts alone.
-        """
-        spec = self.spec
-        is_tree = spec.fixed_base and spec.mjcf is None and self.dof > 0
-        return is_tree and place_of_contacts() is not None
 
     @property
     def data(self) -> list[MjData]:
@@ -131,18 +124,16 @@ class MujocoPack(EnginePack):
 
     def read_qpos(self) -> Float64:
         if self._free is not None:
-            return self._free.read()[0]
+            return self._free.read(0)
         return np.array([data.qpos[self._at] for data in self.data])
 
     def read_qvel(self) -> Float64:
         if self._free is not None:
-            return self._free.read()[1]
+            return self._free.read(1)
         return np.array([data.qvel[self._moves] for data in self.data])
 
     def passive_force(self, gravity: bool, coriolis: bool) -> Float64:
-        if self.steps_read_force(gravity, coriolis):
-            if self._free is not None:
-                return self._force(self.force_model, True, True)
+        if self._free is None and self.steps_read_force(gravity, coriolis):
             return np.array([data.qfrc_bias[self._moves] for data in self.data])
         return self._force(self.force_model, gravity, coriolis)
 
@@ -210,7 +201,7 @@ class MujocoPack(EnginePack):
         """Return pose and velocities of the bodies of floating bases (M, 13), angular ones in the
         body's axes.
         """
-        qpos, qvel = self._robot.base or (0, 0)
+        qpos, qvel = self._robot.base
         parts = slice(qpos, qpos + FLOATING + 1), slice(qvel, qvel + FLOATING)
         return np.array(
             [np.concatenate([data.qpos[parts[0]], data.qvel[parts[1]]]) for data in self.data]
@@ -239,11 +230,10 @@ class MujocoPack(EnginePack):
     def push(self, rows: Sequence[int], twists: Float64) -> None:
         data = self.data
         turns = matrix_of(self._bases()[rows, 3:7])
-        _, at = self._robot.base or (0, 0)
+        _, at = self._robot.base
         for row, twist, turn in zip(rows, twists, turns, strict=True):
-            data[row].qvel[at : at + 3] += twist[:3]
             # MuJoCo's angular velocities are in the body's axes.
-            data[row].qvel[at + 3 : at + FLOATING] += turn.T @ twist[3:]
+            data[row].qvel[at : at + FLOATING] += [*twist[:3], *(turn.T @ twist[3:])]
         self._evaluate(rows)
 
     def write_state(
@@ -274,9 +264,8 @@ class MujocoPack(EnginePack):
     ) -> None:
         """Write the states of robots ``rows`` to their data."""
         everyone = self._pool.take(self.models, self.rows, rows)
-        floats = self._robot.base is not None
         bases = np.tile(BASE_AT_REST, (len(rows), 1)) if base is None else base.copy()
-        at, moves = self._robot.base or (0, 0)
+        at, moves = self._robot.base
         # MuJoCo's angular velocities are in the body's axes.
         bases[:, 10:] = unrotate(matrix_of(bases[:, 3:7]), bases[:, 10:])
         for row, root, position, velocity in zip(rows, bases, qpos, qvel, strict=True):
@@ -284,7 +273,7 @@ class MujocoPack(EnginePack):
             # Everything else of the scene returns to its start, but drives keep their targets.
             ctrl = data.ctrl.copy()
             rest(self.models[row], data)
-            if floats:
+            if not self.spec.fixed_base:
                 data.qpos[at : at + FLOATING + 1], data.qvel[moves : moves + FLOATING] = np.split(
                     root, [FLOATING + 1]
                 )
@@ -302,17 +291,32 @@ class MujocoPack(EnginePack):
         values = {"dof_armature": np.maximum(armature + self._add_joints(actuators), 0.0)}
         if self.spec.mjcf is not None and self._variation.damping is not None:
             values["dof_damping"] = np.maximum(damping + self._variation.damping, 0.0)
-        tables = {name: np.broadcast_to(table, self.qf.shape) for name, table in values.items()}
-        for row in range(self.size) if rows is None else rows:
-            for name, table in tables.items():
-                if not np.array_equal(
-                    getattr(self.models[row], name)[self._robot.qvel], table[row]
-                ):
-                    # A copy only where it differs: a model takes much memory.
-                    model = self._own_model(row)
-                    getattr(model, name)[self._robot.qvel] = table[row]
-                    mujoco.mj_setConst(model, self._scratch)
+        everyone = range(self.size)
+        for row in self._set(everyone if rows is None else rows, self._moves, values):
+            mujoco.mj_setConst(self.models[row], self._scratch)
         self._share()
+
+    def _set(
+        self,
+        rows: Iterable[int],
+        at: slice | Rows,
+        values: Mapping[str, Rows],
+    ) -> list[int]:
+        """Set the entries ``at`` of fields of the models of robots ``rows`` to ``values`` (M | 1,
+        entries, ...); return the robots whose models changed.
+        """
+        changed = []
+        for row in rows:
+            present = {name: table[row % len(table)] for name, table in values.items()}
+            model = self.models[row]
+            # A copy only where they differ: a model takes much memory.
+            if all(np.array_equal(getattr(model, name)[at], new) for name, new in present.items()):
+                continue
+            model = self._own_model(row)
+            for name, new in present.items():
+                getattr(model, name)[at] = new
+            changed.append(row)
+        return changed
 
     def _share(self) -> None:
         """Return to one shared model if neither masses nor worlds nor armature nor drives of the
@@ -397,24 +401,19 @@ class MujocoPack(EnginePack):
         self._stiffness, self._rate_gain = (
             np.broadcast_to(table, self.qf.shape).copy() for table in (stiffness, damping)
         )
-        gains = np.stack(
-            [-self._stiffness, -self._rate_gain - self.spec.timestep * self._stiffness], axis=2
-        )
-        for row in range(self.size):
-            model = self.models[row]
-            if not (
-                np.array_equal(model.actuator_biasprm[:, 1:3], gains[row])
-                and np.array_equal(model.actuator_forcerange[:, 1], limit[row])
-            ):
-                model = self._own_model(row)
-                model.actuator_biasprm[:, 1:3] = gains[row]
-                model.actuator_forcerange[:] = np.stack([-limit[row], limit[row]], axis=1)
+        bias = np.zeros((*self.qf.shape, mujoco.mjNBIAS))
+        bias[..., 1] = -self._stiffness
+        bias[..., 2] = -self._rate_gain - self.spec.timestep * self._stiffness
+        values = {
+            "actuator_biasprm": bias,
+            "actuator_forcerange": np.stack([-limit, limit], axis=2),
+        }
+        self._set(range(self.size), slice(None), values)
         self._update(range(self.size))
 
     def write_drive_target(self, position: Rows, velocity: Rows | None = None) -> None:
-        if velocity is not None:
-            self._target_rate = velocity
-        values = self._stiffness * position + self._rate_gain * self._target_rate
+        rate = 0.0 if velocity is None else velocity
+        values = self._stiffness * position + self._rate_gain * rate
         if self._free is not None:
             self._free.ctrl[...] = values
             return

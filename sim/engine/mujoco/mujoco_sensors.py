@@ -82,24 +82,28 @@ def wrench_tables(spec: SceneSpec, added: Mapping[str, Float64], size: int) -> d
     tree = spec.rigid_tree
     is_fixed = np.array(tree.joint_types) == "fixed"
     parents = np.asarray(tree.parent)
-    tables: dict[str, list[Rows]] = {"carriers": [], "hanging": [], "frames": [], "carried": []}
-    for name in spec.wrenches or ():
-        link = tree.index(name)
+    links = [tree.index(name) for name in spec.wrenches or ()]
+    carriers = np.array(tree.link_bodies, np.int32)[links]
+    hanging = np.zeros((len(links), tree.dof), np.int32)
+    carried = np.zeros((size, len(links), 13))
+    for row, link in enumerate(links):
         # The link, and all that fixed joints hold to it.
         inside = np.arange(len(parents)) == link
         for held in np.flatnonzero(is_fixed[1:]) + 1:
             inside[held] |= inside[parents[held]]
+        hanging[row] = inside[parents[~is_fixed]]
         part = replace(tree, mass=inside * tree.mass, inertia=inside[:, None, None] * tree.inertia)
-        varied = {link: rows for link, rows in added.items() if inside[tree.index(link)]}
-        inertias = part.inertias(part.varied(varied) if varied else None)
-        carrier = tree.link_bodies[link]
-        frame = tree.bodies.link_frames[link]
-        tables["carriers"].append(np.array(carrier, np.int32))
-        tables["hanging"].append(inside[parents[~is_fixed]].astype(np.int32))
-        tables["frames"].append(np.hstack([frame[:, :3].T.ravel(), frame[:, 3]]))
-        tables["carried"].append(np.broadcast_to(inertias[..., carrier, :], (size, 13)))
-    stacked = {name: np.array(rows) for name, rows in tables.items()}
-    return stacked | {"carried": np.swapaxes(stacked["carried"], 0, 1).copy()}
+        varied = {name: rows for name, rows in added.items() if inside[tree.index(name)]}
+        bodies = part.varied(varied) if varied else None
+        carried[:, row] = part.inertias(bodies)[..., carriers[row], :]
+    frames = tree.bodies.link_frames[links]
+    axes = np.swapaxes(frames[..., :3], 1, 2).reshape(-1, 9)
+    return {
+        "carriers": carriers,
+        "hanging": hanging,
+        "frames": np.hstack([axes, frames[..., 3]]),
+        "carried": carried,
+    }
 
 
 class MujocoLinkSensors:

@@ -214,7 +214,7 @@ class MujocoStep(NativeStep):
             **addresses, **{name: array.ctypes.data for name, array in arrays.items()}
         )
         robots.sensor_size = arrays["sensed"].shape[1]
-        robots.base_qpos, robots.base_qvel = robot.base or (0, 0)
+        robots.base_qpos, robots.base_qvel = robot.base
         if free is not None:
             robots.free = free.address
         clearance = None

@@ -49,8 +49,6 @@ _ALONG_Z = Pose(q=[0.7071068, 0.0, 0.7071068, 0.0])
 def articulation_builder(spec: SceneSpec) -> ArticulationBuilder:
     """Return a builder that makes any number of copies of the robot, the same object for equal
     specs.
-
-    Raises RobotError for a body whose moments of inertia are not positive.
     """
     builder = ArticulationBuilder()
     tables = spec.simulated
@@ -63,7 +61,7 @@ def articulation_builder(spec: SceneSpec) -> ArticulationBuilder:
             parent = links[joint.parent_link]
         links[body.name] = link = builder.create_link_builder(parent)
         link.set_name(body.name)
-        moments, axes = _principal(body.inertia, body.name)
+        moments, axes = _principal(body.inertia)
         frame = _pose(body.center, matrix_of(body.inertia_wxyz))
         link.set_mass_and_inertia(body.mass, frame * _pose(np.zeros(3), axes), moments)
         if joint is None:
@@ -128,7 +126,7 @@ def _axes_along(axis: tuple[float, ...]) -> Float64:
     return np.column_stack([first, second, np.cross(first, second)])
 
 
-def _principal(inertia: Float64, name: str) -> tuple[Float64, Float64]:
+def _principal(inertia: Float64) -> tuple[Float64, Float64]:
     """Return the principal moments (3,) and axes (3, 3), those of the frame if they are
     principal.
     """
@@ -137,20 +135,15 @@ def _principal(inertia: Float64, name: str) -> tuple[Float64, Float64]:
     if not np.array_equal(np.diag(moments), inertia):
         moments, axes = np.linalg.eigh(inertia)
         axes[:, 2] *= np.sign(np.linalg.det(axes))
-    if not (moments > 0).all():
-        raise RobotError(
-            f"link {name!r}: moments of inertia {moments} must be positive; correct <inertia>"
-        )
     return moments, axes
 
 
 def set_inertia(link: physx.PhysxArticulationLinkComponent, inertia: SpatialInertia) -> None:
     """Give one of SAPIEN's links this inertia, in the frame of the link."""
-    principal, axes = np.linalg.eigh(inertia.tensor)
+    moments, axes = inertia.principal
     link.set_mass(inertia.mass)
-    # A rotation, not a reflection.
-    link.set_cmass_local_pose(_pose(inertia.center, axes * np.linalg.det(axes)))
-    link.set_inertia(principal)
+    link.set_cmass_local_pose(_pose(inertia.center, axes))
+    link.set_inertia(moments)
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -73,11 +74,9 @@ class Pack(EnginePack):
         self.qf = np.zeros((size, self.dof), np.float32)
         continuous = np.array([joint.continuous for joint in spec.joints], bool)
         self._couple(continuous, None, self.qf)
-        self._joint_qf = self.qf
-        self._turning = np.array([], np.intp)
-        if self._constraint is not None:
-            self._joint_qf = np.zeros_like(self.qf)
-            self._turning = np.flatnonzero(continuous)
+        is_coupled = self._constraint is not None
+        self._joint_qf = np.zeros_like(self.qf) if is_coupled else self.qf
+        self._turning = np.flatnonzero(continuous & is_coupled)
         self._bind()
         if variation is not None:
             self.write_joints(None)
@@ -248,7 +247,7 @@ class Pack(EnginePack):
         sensed = self.spec.contacts or ()
         bodies = self.spec.simulated.links
         forces = np.zeros((self.size, len(sensed), 3))
-        for row in np.flatnonzero(self._stepped) if sensed else ():
+        for row in np.flatnonzero(self._stepped):
             entities = {link.name: link.entity for link in self.robots[row].links}
             places = {entities[bodies[link].link]: place for place, link in enumerate(sensed)}
             for contact in self.systems[row].get_contacts():
@@ -256,7 +255,7 @@ class Pack(EnginePack):
                 for body, sign in zip(contact.bodies, (1.0, -1.0), strict=True):
                     if (place := places.get(body.entity)) is not None:
                         forces[row, place] += sign * impulse / self.spec.timestep
-        return {"contact_force": forces, "touching": np.abs(forces).sum(2)} if sensed else {}
+        return {"contact_force": forces, "touching": np.abs(forces).sum(2)}
 
     def write_state(
         self,
@@ -351,10 +350,7 @@ class Pack(EnginePack):
             )
             parts = robot.get_qpos(), robot.get_qvel(), read_body(robot.root), turned, *content
             rows.append(np.concatenate(parts, dtype=np.float64))
-        states = np.full((self.size, max(map(len, rows))), np.nan)
-        for state, values in zip(states, rows, strict=True):
-            state[: len(values)] = values
-        return states
+        return np.array([*zip_longest(*rows, fillvalue=np.nan)]).T.copy()
 
     def write_state_rows(self, states: Float64) -> None:
         ends = np.cumsum([self.dof, self.dof, ROOT_SIZE, self._turning.size])
@@ -400,11 +396,11 @@ class Pack(EnginePack):
             joint.set_drive_properties(*map(float, values), "force")
 
     def write_drive_target(self, position: Rows, velocity: Rows | None = None) -> None:
-        for joint, target in zip(self._joints, position.ravel().tolist(), strict=True):
+        rates = np.zeros_like(position) if velocity is None else velocity
+        targets = position.ravel().tolist(), rates.ravel().tolist()
+        for joint, target, rate in zip(self._joints, *targets, strict=True):
             joint.set_drive_target(target)
-        if velocity is not None:
-            for joint, target in zip(self._joints, velocity.ravel().tolist(), strict=True):
-                joint.set_drive_velocity_target(target)
+            joint.set_drive_velocity_target(rate)
 
     def close(self) -> None:
         self.robots = []

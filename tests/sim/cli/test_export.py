@@ -38,7 +38,6 @@ def test_followers_are_reported_and_left_out_of_controllers(batchpid, tmp_path):
     path = write(tmp_path, robot(*map(link, "xyz"), joint("a", "x", "y"), MIMIC))
     status, said, _ = batchpid("export", path, "--out", out := tmp_path / "arm.h")
     assert (status, "\ndiffers: b: followers are separate joints" in said) == (0, True)
-    assert "\n/* differs: b: followers are separate joints" in out.read_text()
     out = tmp_path / "controllers.yaml"
     status, said, _ = batchpid("export", path, "--to", "ros2_control", "--out", out)
     assert (status, "differs: b: followers are not in the file" in said) == (0, True)
@@ -58,7 +57,6 @@ def test_controllers_of_ros2_control_are_written(batchpid, tmp_path):
     assert (status, said.splitlines()[-1]) == (0, f"written: {out}")
     listed = {line.split(":")[1].strip() for line in said.splitlines()[1:-1]}
     assert {"gain_units", "effort_limit"} <= listed
-    assert all(f"# {line}\n" in out.read_text() for line in said.splitlines()[1:-1])
     assert "arm" in yaml.safe_load(out.read_text())
 
 
@@ -83,7 +81,7 @@ def test_the_robot_is_written_for_mujoco(batchpid, tmp_path):
     for gains, line, stiffness in (
         ((), "The file has no differences.", 0),
         (("--gains", "designed"), "\ndiffers: ki: no integral\n", None),
-        (("--gains", "drive:20,5"), "The file has no differences.", 20),
+        (("--gains", "drive"), "The file has no differences.", 20),
     ):
         status, said, _ = batchpid(*words, *gains)
         assert (status, line in said) == (0, True), said

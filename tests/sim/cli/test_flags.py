@@ -131,7 +131,6 @@ def written(folder):
         ("rollout --setpoint 1 2", "setpoint: has shape (2,)"),
         ("rollout --out a.npz", "out: unknown file format"),
         ("rollout --gains tunned", "use tuned, designed, "),
-        ("compare --gains drive:-1,3", "gains: is no drive"),
         ("identify arm.urdf", "logs: are missing"),
         ("export panda --gains drive", "gains: belong to a drive"),
         ("inspect panda2", "'panda2'"),

@@ -10,7 +10,6 @@ from robots import load_bundled
 from test_unsettled import CASES as RUNS
 from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, robot, write
 
-import batchpid as bp
 from batchpid.sim import Robot
 from batchpid.sim.findings import FINDING_KINDS, SEVERITIES
 
@@ -124,12 +123,6 @@ ODDITIES = {
         "effort-limit",
         "gravity up to 9..*friction 2, ",
     ),
-    "no range": (
-        one_joint('<limit lower="0.5" upper="0.5" effort="1" velocity="1"/>'),
-        {},
-        "limits",
-        r"'hinge' .\[0.5, 0.5\].: .*no motion",
-    ),
     "no effort limit": (
         one_joint('<limit lower="-1" upper="1"/>'),
         {},
@@ -169,10 +162,10 @@ def test_each_oddity_of_a_file_has_its_finding(name, tmp_path):
 
 
 def test_every_kind_of_finding_has_a_case():
-    """In these tables, and for params, setpoints and tools in the tests below and beside it."""
+    """In these tables, and for params and setpoints in the tests below and beside it."""
     cases = {code for _, code, _ in REPAIRED.values()} | {case.code for case in RUNS.values()}
     cases |= {code for _, _, code, _ in ODDITIES.values()}
-    assert cases | {"missing-mesh", "continuous", "unstable", "out-of-reach"} == set(FINDING_KINDS)
+    assert cases | {"missing-mesh", "unstable"} == set(FINDING_KINDS)
     assert {kind.severity for kind in FINDING_KINDS.values()} == set(SEVERITIES)
     assert len(FINDING_KINDS) <= 30
 
@@ -211,18 +204,6 @@ def test_links_that_overlap_by_design_or_are_apart_do_not_touch(tmp_path):
     apart = BESIDE.replace('xyz="0 0 1"', 'xyz="0 1 1"', 1)
     loaded = Robot.load(write(tmp_path, apart), self_collision="urdf")
     assert "touching" not in codes(loaded.check())
-
-
-def test_params_that_disagree_with_the_urdf_on_continuous_joints_are_reported(tmp_path):
-    wheel = Robot.load(write(tmp_path, one_joint("", "continuous")))
-    found = codes(wheel.check(params=bp.make_params(1, **GAINS)))
-    assert "jumps where qpos wraps" in found["continuous"].detail
-    assert "continuous" not in codes(wheel.check(params=wheel.params(**GAINS)))
-    hinge = Robot.load(write(tmp_path, one_joint()))
-    wrapped = bp.make_params(1, **GAINS, continuous=[True])
-    assert "short way round" in codes(hinge.check(params=wrapped))["continuous"].detail
-    assert "continuous" not in codes(hinge.check(params=hinge.params(**GAINS)))
-    assert "continuous" not in codes(hinge.check(params=wrapped, control="drive"))
 
 
 def test_the_most_severe_findings_come_first(jaco2):

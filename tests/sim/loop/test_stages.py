@@ -86,11 +86,10 @@ class Fan(Stage):
 
 def test_a_stage_that_programs_cannot_have_runs_in_numpy_and_the_runner_says_so(panda):
     with Runner(panda, 2, workers=0, stages=[Fan()]) as runner:
-        assert "stage 'fan': programs have no operation 'arctan'" in repr(runner)
-        assert "'fan'" in runner.backend
+        assert "stage 'fan': programs have no operation 'arctan'" in runner.backend
         assert runner.step(panda.start).ok.all()
     with Runner(panda, 2, workers=0, stages=[Thermal(8.0, 0.05)]) as runner:
-        assert "stage" not in repr(runner)
+        assert "stage" not in runner.backend
 
 
 @dataclass(frozen=True)
@@ -113,7 +112,7 @@ def test_exp_tanh_and_sin_run_natively_as_in_numpy(panda, monkeypatch):
     for native in "10":
         monkeypatch.setenv("BATCHPID_NATIVE", native)
         with Runner(panda, 2, workers=0, stages=[Wave()]) as runner:
-            assert "stage" not in repr(runner)
+            assert "stage" not in runner.backend
             rows.append(runner.rollout(np.broadcast_to(panda.target, (10, 2, panda.dof))))
     np.testing.assert_allclose(rows[0].qpos, rows[1].qpos, rtol=0, atol=1e-9)
     np.testing.assert_allclose(rows[0].effort, rows[1].effort, rtol=1e-6, atol=1e-6)
@@ -125,17 +124,14 @@ HOPPER = """<mujoco><worldbody><body pos="0 0 1"><joint name="rootz" type="slide
 <actuator><motor joint="hip" ctrlrange="-40 40"/></actuator></mujoco>"""
 
 
-@pytest.mark.parametrize("free", [None, [], ["rootz", "hip"]])
-def test_a_joint_that_no_actuator_moves_falls_and_does_not_hang_on_the_compensation(tmp_path, free):
+def test_a_joint_that_no_actuator_moves_falls_and_does_not_hang_on_the_compensation(tmp_path):
     path = tmp_path / "hopper.xml"
     path.write_text(HOPPER)
     robot = Robot.load(path)
     (said,) = [one for one in robot.check() if one.joint == "rootz" and "no actuator" in one.text]
-    assert "free_joints" in said.remedy
+    assert "a motor in the file" in said.remedy
     params = robot.params(kp=[0.0, 50.0], ki=None, kd=[0.0, 5.0], effort_limit=None)
-    options = {"engine": "mujoco", "workers": 0, "params": params, "free_joints": free}
-    with Runner(robot, 1, **options) as runner:
+    with Runner(robot, 1, engine="mujoco", workers=0, params=params) as runner:
         for _ in range(20):
             seen = runner.step(robot.start)
-    falls = free is None or "rootz" in free
-    assert seen.qpos[0, 0] == pytest.approx(-9.81 * 0.2**2 / 2 if falls else 0.0, abs=2e-3)
+    assert seen.qpos[0, 0] == pytest.approx(-9.81 * 0.2**2 / 2, abs=2e-3)

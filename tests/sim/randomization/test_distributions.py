@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import Choice, LogUniform, Normal, Randomization, Uniform
+from batchpid.sim import LogUniform, Normal, Randomization, Uniform
 
 COUNT = 20_000
 numbers = st.floats(-1e3, 1e3, allow_nan=False)
@@ -25,11 +25,6 @@ distributions = st.one_of(
     ),
     st.builds(
         lambda mean, std, rest: Normal(mean, std, **rest), numbers, st.floats(1e-3, 1e3), options
-    ),
-    st.builds(
-        lambda values, rest: Choice(values, **rest),
-        st.lists(numbers, min_size=1, max_size=5),
-        options,
     ),
 )
 
@@ -59,13 +54,6 @@ def test_a_distribution_has_its_moments(distribution, center, spread):
     assert std == pytest.approx(spread, rel=0.02)
 
 
-def test_choice_draws_all_values_alike_often():
-    drawn = Choice([1, 2, 5]).sample(np.random.default_rng(0), COUNT)
-    values, counts = np.unique(drawn, return_counts=True)
-    assert values.tolist() == [1, 2, 5]
-    np.testing.assert_allclose(counts / COUNT, 1 / 3, atol=0.015)
-
-
 @settings(max_examples=40)
 @given(distributions)
 def test_draws_are_within_the_support(distribution):
@@ -73,12 +61,6 @@ def test_draws_are_within_the_support(distribution):
     low, high = distribution.support
     assert drawn.shape == (50,)
     assert ((drawn >= low) & (drawn <= high)).all()
-
-
-@settings(max_examples=40)
-@given(distributions)
-def test_a_distribution_is_what_its_dict_describes(distribution):
-    assert read(distribution.to_dict()) == Randomization(qpos=distribution)
 
 
 @pytest.mark.parametrize(
@@ -100,8 +82,6 @@ def test_operations(operation, expected):
         (lambda: LogUniform(0, 1), "low: out of range"),
         (lambda: Normal(0, 0), "std: out of range"),
         (lambda: Normal(1e301, 1), "mean: out of range"),
-        (lambda: Choice([]), "values: must be a list of numbers"),
-        (lambda: Choice([math.nan]), "values: must be a list of numbers"),
         (
             lambda: read({"gamma": [1, 2]}),
             "qpos: is not a distribution.*uniform, log_uniform",

@@ -11,7 +11,7 @@ from robots import load_bundled
 
 from batchpid import make_actuators
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import Choice, LogUniform, Normal, Randomization, Robot, Uniform
+from batchpid.sim import LogUniform, Normal, Randomization, Robot, Uniform
 from batchpid.sim.randomization.checks import check_params, check_robot, prepared_actuators
 from batchpid.sim.randomization.distributions import NOTHING, elements
 
@@ -21,7 +21,7 @@ FIELDS = {
     "link_mass": Uniform(0.8, 1.2, operation="scale"),
     "center_of_mass": Uniform(-0.01, 0.01),
     "friction": {"panda_joint1": LogUniform(0.1, 1.0), "panda_joint4": Normal(0.5, 0.1)},
-    "armature": Choice([0.0, 0.1], shared=True),
+    "armature": Uniform(0.0, 0.1, shared=True),
     "qpos": Uniform(-0.1, 0.1),
     "params": {"kp": LogUniform(0.5, 2.0, operation="scale")},
     "actuators": {"command_delay": Uniform(0, 0.005, shared=True)},
@@ -159,9 +159,23 @@ def test_static_friction_may_be_drawn_below_coulombs():
     assert rows.coulomb.tolist() == worn.coulomb.tolist()
 
 
-def test_it_is_what_its_dict_describes():
-    randomization = Randomization(seed=3, per="env", payload_link="panda_hand", **FIELDS)
-    assert Randomization.from_dict(randomization.to_dict()) == randomization
+def test_it_is_what_a_file_describes():
+    described = {
+        "seed": 3,
+        "per": "env",
+        "payload_link": "panda_hand",
+        "payload": {"uniform": [0, 2]},
+        "friction": {"panda_joint1": {"normal": [0.5, 0.1]}},
+        "params": {"kp": {"log_uniform": [0.5, 2.0], "operation": "scale", "shared": True}},
+    }
+    assert Randomization.from_dict(described) == Randomization(
+        seed=3,
+        per="env",
+        payload_link="panda_hand",
+        payload=Uniform(0, 2),
+        friction={"panda_joint1": Normal(0.5, 0.1)},
+        params={"kp": LogUniform(0.5, 2.0, operation="scale", shared=True)},
+    )
     assert Randomization(**FIELDS) == Randomization(**MappingProxyType(FIELDS | READ_ONLY))
 
 

@@ -77,10 +77,5 @@ def test_designed_gains_have_one_bandwidth_with_the_mass_matrix(panda):
         panda.designed("mass")
 
 
-def test_the_repr_is_short_and_names_robot_joints_mass_and_file(panda, jaco2):
-    for robot, dof, mass in ((panda, 9, "17.45 kg"), (jaco2, 13, "5.557 kg")):
-        text = repr(robot)
-        assert len(text.splitlines()) <= 3
-        assert text.startswith(f"Robot({robot.name!r}, {dof} dof, {mass}, path=")
-        assert robot.joint_names[0] in text
-        assert str(robot.path) in text
+def test_the_repr_names_robot_size_and_file(panda):
+    assert repr(panda) == f"Robot('panda', 9 dof, path={str(panda.path)!r})"

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from faulty_urdfs import REPAIRED
-from tiny_urdf import INERTIAL, LIMIT, joint, link, random_tree, robot, write
+from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, random_tree, robot, write
 
 from batchpid.sim import Robot, to_urdf
 from batchpid.task_space.frames import matrix_of
@@ -70,3 +70,14 @@ def test_mimics_soft_limits_and_limits_of_continuous_joints_are_kept(tmp_path):
     again = written_again(loaded, tmp_path)
     assert_same(again, loaded)
     assert (again.joints[0].soft_upper, again.joints[2].effort_limit) == (0.5, 3.0)
+    assert to_urdf(loaded).differences == ("k_velocity of each <safety_controller> is 1",)
+
+
+def test_visuals_are_kept(tmp_path):
+    shape = '<geometry><box size="1 2 3"/></geometry>'
+    red = '<material name="r"><color rgba="1 0 0 1"/></material>'
+    seen = f"<visual>{shape}{red}</visual><visual>{shape}</visual>"
+    loaded = Robot.load(write(tmp_path, one_joint(arm=INERTIAL + seen)))
+    again = written_again(loaded, tmp_path)
+    assert [visual.rgba for visual in again.tables.visuals["arm"]] == [(1, 0, 0, 1), None]
+    assert again.tables.visuals["arm"][1].shape.size == (0.5, 1, 1.5)

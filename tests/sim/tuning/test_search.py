@@ -30,14 +30,12 @@ def few_moves(monkeypatch):
 
 
 def test_gains_and_implicit_laws_are_refused(panda):
-    motors = make_actuators(panda.dof, strength=0.9)
     for options, message in (
         (
             {"params": panda.designed()},
             r"params: .*explicit gains; .*bp\.design_gains makes implicit gains",
         ),
         ({"discretization": "implicit"}, r"discretization: .*explicit gains; .*bp\.design_gains"),
-        ({"motors": motors, "actuators": motors}, "actuators: cannot be combined with motors"),
     ):
         with pytest.raises(InvalidArgumentError, match=message):
             tune(panda, workers=0, **options)
@@ -81,15 +79,6 @@ def test_gains_in_efforts_can_be_searched_too(few_moves):
     found = tune(ARM, gain_units="effort", workers=0, **SMALL)
     ratio = found.params.kp / found.start_params.kp
     assert found.cost == found.start_cost or (ratio != 1).all()
-
-
-def test_moves_are_made_with_different_motors_of_which_the_worst_counts(few_moves):
-    motors = make_actuators(ARM.dof, command_delay=np.array([[1e-3], [4e-2]]).repeat(ARM.dof, 1))
-    options = SMALL | {"workers": 0, "generations": 1, "seconds": 0.3}
-    late, mixed, early = (
-        tune(ARM, motors=motors.for_envs(rows), **options) for rows in ([1, 1], [0, 1], [0, 0])
-    )
-    assert early.start_cost < mixed.start_cost < late.start_cost
 
 
 @pytest.mark.slow

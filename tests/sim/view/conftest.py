@@ -26,8 +26,8 @@ def serve():
 
     running = []
 
-    def serve(data, port=18080):
-        view = View(data, port=port)
+    def serve(data):
+        view = View(data, port=0)
         thread = threading.Thread(target=view.run)
         thread.start()
         running.append((view, thread))

@@ -118,6 +118,6 @@ def test_a_recorded_run_plays(jaco2, serve, open_page, until):
     with Runner(jaco2, 2, params=jaco2.params(), workers=0, substeps=66) as runner:
         rollout = runner.rollout(np.broadcast_to(jaco2.target, (45, jaco2.dof)))
     playback = Playback(rollout, jaco2)
-    page = open_page(serve(playback, port=18090).url)
+    page = open_page(serve(playback).url)
     until(lambda: dark(picture(page)) > 500, what="drawing the robots")
     until(lambda: playback.time > 0.5, what="playing")

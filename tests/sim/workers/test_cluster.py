@@ -100,7 +100,7 @@ def test_results_are_bit_identical_after_the_loss_of(disturb, cluster):
         pids = all_pids()
         assert len(pids) >= 4
         with pytest.warns(
-            RecoveryWarning, match=r"node [01] \(envs (0 to 5|6 to 11)\) (died|lost|is stuck)"
+            RecoveryWarning, match=r"node [01] \(envs (0 to 5|6 to 11)\) (is lost|lost a worker)"
         ):
             results = program(runner, lambda: disturb(cluster))
         for one, two in zip(expected, results, strict=True):
