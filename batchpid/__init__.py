@@ -10,10 +10,10 @@ Params say how to control, a state is carried from step to step, and every array
     effort = pid(np.ones((64, 9)), np.zeros((64, 9)))  # setpoint, measurement
 
 - Control: :class:`BatchPID`, or the pure functions :func:`init`, :func:`step`, :func:`reset` and
-  :func:`track`, which take and return a :class:`PIDState`; :func:`discretise` and :func:`advance` for loops with
-  constant params, and for all terms of the effort.
-- Params: :func:`make_params`, ``params.replace(...)``; :mod:`batchpid.gains.presets` for the
-  tutorial's; :func:`save_params`, :func:`load_params`, :func:`dumps_params`, :func:`loads_params`.
+  :func:`track`, which take and return a :class:`PIDState`; :func:`discretise` and :func:`advance`
+  for loops with constant params, and for all terms of the effort.
+- Params: :func:`make_params`, ``params.replace(...)``; :func:`save_params`, :func:`load_params`,
+  :func:`dumps_params`, :func:`loads_params`.
 - Gains: :func:`design_gains` from a robot's inertia; :func:`stability_bound`.
 - Limits of setpoints: :func:`make_guard` and :mod:`batchpid.motors.guard`.
 - Chunks of a slow policy: :func:`make_plan` and :mod:`batchpid.plan`.
@@ -29,7 +29,6 @@ Requires NumPy alone; JAX and PyYAML are imported on first use.
 from batchpid import motors, plan
 from batchpid.controller import BatchPID
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
-from batchpid.gains import presets
 from batchpid.gains.design import design_gains
 from batchpid.gains.stability import stability_bound
 from batchpid.io.documents import dumps_params, load_params, loads_params, save_params
@@ -72,7 +71,6 @@ __all__ = [
     "make_plan",
     "motors",
     "plan",
-    "presets",
     "reset",
     "save_actuators",
     "save_params",

@@ -10,7 +10,7 @@ import numpy as np
 from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import precision, require_jax
 from batchpid.law import pid
-from batchpid.law.coefficients import discretise
+from batchpid.law.coefficients import discretise, spread
 from batchpid.law.params import PIDParams
 from batchpid.law.state import PIDState
 from batchpid.native.array_program import obstacle
@@ -39,7 +39,8 @@ class NumPyBackend:
     def prepare(self, params: PIDParams, shape: tuple[int, int]) -> None:
         """Take params for (envs, joints) ``shape``."""
         self.params = params
-        self.coefficients = discretise(params, self.dt, 1 if self.native else shape[0])
+        k = discretise(params, self.dt)
+        self.coefficients = k if self.native else spread(k, shape[0])
         self._law = CompiledLaw(self.coefficients, shape[0]) if self.native else None
 
     def array(self, value: Array) -> Array:

@@ -64,12 +64,9 @@ def positive(argument: str, value: object, unit: str) -> float:
     """Return ``value`` as a finite float above 0."""
     value = _scalar(argument, value, unit)
     if not 0 < value < math.inf:
-        raise InvalidArgumentError(
-            argument,
-            "must be positive and finite",
-            value=value,
-            remedy=f"use a number > 0 ({unit})",
-        )
+        problem = "must be positive and finite"
+        remedy = f"use a number > 0 ({unit})"
+        raise InvalidArgumentError(argument, problem, value=value, remedy=remedy)
     return value
 
 
@@ -368,11 +365,8 @@ def env_mask(argument: str, value: ArrayLike, num_envs: int) -> NDArray[np.bool_
     """Return ``value`` as one bool per env (envs,), a copy."""
     mask = read_array(argument, value, "b").copy()
     if mask.shape != (num_envs,):
-        raise InvalidArgumentError(
-            argument,
-            f"has shape {mask.shape}, needs ({num_envs},)",
-            remedy="use e.g. mask = ~obs.ok",
-        )
+        problem = f"has shape {mask.shape}, needs ({num_envs},)"
+        raise InvalidArgumentError(argument, problem, remedy="use e.g. mask = ~obs.ok")
     return mask
 
 

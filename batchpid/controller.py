@@ -80,18 +80,6 @@ class BatchPID(SingleOwner):
         self._params = params
         self.params = params
 
-    def __repr__(self) -> str:
-        if self._state is None:
-            started = "not started"
-        else:
-            started = "started"
-        envs, joints = self._shape
-        backend = f"{self._backend!r}{' (native)' * self.native}"
-        return (
-            f"BatchPID({envs} envs, {joints} joints, dt {self._dt:g} s, backend {backend},"
-            f" {started})"
-        )
-
     @property
     def num_envs(self) -> int:
         """Number of envs."""

@@ -138,10 +138,6 @@ class ClosedError(BatchPIDError, RuntimeError):
     """The object was closed before this call."""
 
 
-class CallOrderError(BatchPIDError, RuntimeError):
-    """Calls in an invalid order, such as ``recv`` without ``send``."""
-
-
 class NotCopyableError(BatchPIDError, TypeError):
     """The object owns processes, files or native memory, and can be neither copied nor pickled."""
 

@@ -31,10 +31,11 @@ def law_and_motors(robot, num_envs):
         law, motor, qpos = state
         qvel = jnp.zeros_like(qpos)
         law, effort = bp.step(params, law, qpos + 0.1, qpos, DT, measurement_rate=qvel)
-        motor, effort = bp.motors.deliver(motors, motor, effort, qpos, qvel, DT)
+        motor, effort = bp.motors.advance_effort(k, motor, effort, qvel)
         return (law, motor, qpos + 1e-6 * effort), None
 
     state = bp.init(params, qpos), bp.motors.init(motors, qpos, DT), qpos
+    k = bp.motors.discretise(motors, state[1], DT)
     return lambda state: jax.lax.scan(step, state, length=STEPS)[0], state
 
 

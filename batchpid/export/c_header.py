@@ -16,7 +16,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array, Document, MeasuredRate
+from batchpid.arrays.array_types import Array, Document
 from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.trees import is_leaf, leaves, parts, structure
 from batchpid.checks import choice, instance, names, time_step
@@ -56,7 +56,7 @@ def to_c(
     *,
     joint_names: Sequence[str] | None = None,
     guard: Guard | None = None,
-    inputs: Sequence[str] | None = None,
+    inputs: Sequence[str] = ("feedforward",),
     prefix: str = "batchpid",
     tree: RigidTree | None = None,
     plan: Plan | None = None,
@@ -75,8 +75,8 @@ def to_c(
     guard
         Limits of the setpoint, applied before the law.
     inputs
-        Optional inputs of a step, of :data:`RATES`. Default: the feedforward, and the measured
-        velocity if the params ask for it.
+        Optional inputs of a step, of :data:`RATES`; beside them the measured velocity if the params
+        ask for it, and the rate of the setpoint with a plan.
     prefix
         Beginning of every name in the header, for several controllers in one program.
     tree
@@ -149,17 +149,13 @@ def to_c(
     return Exported(text, () if plan is None else (NO_ACCELERATION,))
 
 
-def _optional(params: PIDParams, inputs: Sequence[str] | None, plan: Plan | None) -> list[str]:
+def _optional(params: PIDParams, inputs: Sequence[str], plan: Plan | None) -> list[str]:
     """Return the optional inputs of a step, in the order of RATES."""
-    measures = isinstance(params.measurement_rate, MeasuredRate)
-    if inputs is None:
-        inputs = ["feedforward", *["measurement_rate"] * measures]
-        inputs += ["setpoint_rate"] * (plan is not None)
     chosen = {choice("inputs", name, RATES) for name in inputs}
-    if measures and "measurement_rate" not in chosen:
-        remedy = "add it, or use params.replace(measurement_rate='difference')"
-        problem = "lack measurement_rate, which the params use"
-        raise InvalidArgumentError("inputs", problem, remedy=remedy)
+    if params.measurement_rate is not None:
+        chosen.add("measurement_rate")
+    if plan is not None:
+        chosen.add("setpoint_rate")
     return [name for name in RATES if name in chosen]
 
 
@@ -256,9 +252,6 @@ def _frame(
     arguments = "".join(
         f",\n    const {t} {name}[{sizes.get(name, n)}] /* {units[name]} */" for name in inputs
     )
-    # A class of C++ wraps the same functions.
-    passed = "".join(f", {name}" for name in inputs)
-    pointers = "".join(f"const {t} *{name}, " for name in inputs)
     fields = "".join(f"  {t} {name}[{n}];\n" for name in state) or "  char unused;\n"
     # A restart keeps the integral; a start sets it to 0, within its limits.
     every = _started(c, state)
@@ -303,17 +296,6 @@ static inline void {p}_step(
 
 #ifdef __cplusplus
 }}
-
-/* The law and its state as an object. */
-class {p}_controller {{
- public:
-  explicit {p}_controller(const {t} *measurement) {{ {p}_init(&state_, measurement); }}
-  void reset(const {t} *measurement) {{ {p}_reset(&state_, measurement); }}
-  void step({pointers}{t} *effort) {{ {p}_step(&state_{passed}, effort); }}
-
- private:
-  {p}_state state_;
-}};
 #endif
 #endif
 """

@@ -1,4 +1,4 @@
-"""Gains: their design, the stability of the loop under them, presets."""
+"""Gains: their design, and the stability of the loop under them."""
 
 from batchpid.gains.design import design_gains, pid_from_inertia
 from batchpid.gains.stability import stability_bound

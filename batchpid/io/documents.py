@@ -1,4 +1,5 @@
-"""Documents that people read and edit, as YAML or JSON: a head, and one entry per joint, by name.
+"""Documents that people read and edit, as YAML: a head, and one entry per joint, by name. The same as
+JSON is part of recordings.
 
 A file of params has this form; the keys are the options of :func:`batchpid.make_params`::
 
@@ -32,7 +33,7 @@ from batchpid.law.params import LAW_FIELDS, PIDParams, make_params
 
 R = TypeVar("R", bound="Record")
 
-SUFFIXES = {".yaml": "yaml", ".yml": "yaml", ".json": "json"}
+SUFFIXES = (".yaml", ".yml")
 
 
 @dataclass(frozen=True)
@@ -58,30 +59,17 @@ class RecordFile(Generic[R]):
     partial: bool = False
     """Whether a file may leave joints out, whose options are then off."""
 
-    def dumps(
-        self,
-        record: R,
-        joint_names: Sequence[str],
-        about: Mapping[str, object] | None = None,
-        format: str = "yaml",
-    ) -> str:
-        """Return a record as text.
+    def dumps(self, record: R, joint_names: Sequence[str]) -> str:
+        """Return a record as JSON, whose numbers include NaN and Infinity.
 
-        Parameters
-        ----------
-        joint_names
-            One name per joint.
-        about
-            Kept with the record, e.g. where it comes from: plain numbers, strings, lists,
-            mappings.
-        format
-            "yaml" or "json".
-
-        Raises
-        ------
-        InvalidArgumentError
-            A record of another type, names that do not fit it, or an unknown format.
+        Raises InvalidArgumentError for a record of another type, or names that do not fit it.
         """
+        return json.dumps(self._document(record, joint_names, None))
+
+    def _document(
+        self, record: R, joint_names: Sequence[str], about: Mapping[str, object] | None
+    ) -> Document:
+        """Return the document of a record."""
         instance(self.record.NAME, record, self.record, f"build them with {self.make.__name__}")
         joints = names("joint_names", joint_names, record.num_joints or None)
         options = record.options()
@@ -91,17 +79,11 @@ class RecordFile(Generic[R]):
         document |= {name: options.pop(name) for name in self.head if name in options}
         if "dtype" in document:
             document["dtype"] = str(document["dtype"])
-        return render(document | {"joints": self.entries(options, joints)}, format)
+        return document | {"joints": self.entries(options, joints)}
 
     def loads(self, text: str, joint_names: Sequence[str] | None = None) -> tuple[R, list[str]]:
-        """Return the record in a text, JSON if it begins with a brace and else YAML; otherwise as
-        :meth:`load`.
-        """
-        if text.lstrip().startswith("{"):
-            format = "json"
-        else:
-            format = "yaml"
-        return self._built("text", parse("text", text, format), joint_names)
+        """Return the record in a text of JSON; otherwise as :meth:`load`."""
+        return self._built("text", parsed("text", json.loads, text), joint_names)
 
     def save(
         self,
@@ -110,13 +92,24 @@ class RecordFile(Generic[R]):
         joint_names: Sequence[str],
         about: Mapping[str, object] | None = None,
     ) -> None:
-        """Write a record to ``path`` (.yaml, .yml or .json), as :meth:`dumps`.
+        """Write a record to ``path`` (.yaml or .yml). An existing file is replaced as a whole or not
+        at all.
 
-        An existing file is replaced as a whole or not at all.
+        Parameters
+        ----------
+        joint_names
+            One name per joint.
+        about
+            Kept with the record, e.g. where it comes from: plain numbers, strings, lists,
+            mappings.
+
+        Raises
+        ------
+        InvalidArgumentError
+            A record of another type, names that do not fit it, or an unknown format.
         """
         path = file_path("path", path, SUFFIXES)
-        format = SUFFIXES[path.suffix.lower()]
-        write_atomically(path, self.dumps(record, joint_names, about, format))
+        write_atomically(path, render(self._document(record, joint_names, about)))
 
     def load(
         self, path: str | os.PathLike[str], joint_names: Sequence[str] | None = None
@@ -232,7 +225,7 @@ def _column(
 def read(path: str | os.PathLike[str]) -> Any:
     """Return the document in a file. Raises InvalidArgumentError for a file that holds none."""
     path = file_path("path", path, SUFFIXES)
-    return parse(str(path), path.read_bytes(), SUFFIXES[path.suffix.lower()])
+    return parsed(str(path), _parse_yaml, path.read_bytes())
 
 
 @contextmanager
@@ -249,25 +242,18 @@ def named(source: str) -> Iterator[None]:
         raise InvalidArgumentError(f"{source}: {error.argument}", error.problem, **facts) from None
 
 
-def parse(source: str, text: str | bytes, format: str) -> Any:
-    """Return the document in a text in ``format``; ``source`` names it in errors."""
+def parsed(source: str, parse: Callable[[Any], Any], text: str | bytes) -> Any:
+    """Return the document that ``parse`` makes of a text; ``source`` names it in errors."""
     try:
-        text = text.decode() if isinstance(text, bytes) else text
-        if format == "json":
-            return _parse_json(text)
-        return _parse_yaml(text)
+        return parse(text)
     except Exception as error:  # a damaged text can make the parser raise anything
         cause = " ".join(str(error).split())[:300] or type(error).__name__
         problem = f"cannot be read: {cause}"
         raise InvalidArgumentError(source, problem, remedy="correct the file") from None
 
 
-def render(document: Document, format: str) -> str:
-    """Return a document as text in ``format``, "yaml" or "json"."""
-    if choice("format", format, ("yaml", "json")) == "json":
-        # JSON has no number for infinities, which are written as "inf" and "-inf".
-        standard = json.loads(json.dumps(document), parse_constant=lambda name: str(float(name)))
-        return json.dumps(standard, indent=2) + "\n"
+def render(document: Document) -> str:
+    """Return a document as YAML."""
     import yaml
 
     return yaml.safe_dump(
@@ -281,7 +267,7 @@ def render(document: Document, format: str) -> str:
 def is_number(entry: object) -> bool:
     """Return whether an entry is a number, an infinity included."""
     whole = isinstance(entry, int) and not isinstance(entry, bool) and abs(entry) < 2**1023
-    return whole or isinstance(entry, float) or entry in ("inf", "-inf")
+    return whole or isinstance(entry, float)
 
 
 def error(
@@ -306,16 +292,7 @@ def plain(column: Rows) -> Any:
     return values
 
 
-def _parse_json(text: str) -> Any:
-    def unique(pairs: list[tuple[str, Any]]) -> Document:
-        if len(dict(pairs)) < len(pairs):
-            raise ValueError(f"a key is given twice among {[key for key, _ in pairs]}")
-        return dict(pairs)
-
-    return json.loads(text, object_pairs_hook=unique)
-
-
-def _parse_yaml(text: str) -> Any:
+def _parse_yaml(text: bytes) -> Any:
     import yaml  # here, since params in memory need NumPy alone
 
     class Loader(yaml.SafeLoader):
@@ -334,7 +311,7 @@ def _parse_yaml(text: str) -> Any:
                 raise ValueError(f"a key is given twice{node.start_mark}")
             return mapping
 
-    return yaml.load(text, Loader=Loader)  # a SafeLoader: plain data only
+    return yaml.load(text.decode(), Loader=Loader)  # a SafeLoader: plain data only
 
 
 PARAMS = RecordFile(

@@ -52,6 +52,7 @@ from typing import NamedTuple
 from batchpid.arrays.array_types import Array, NamedChoice
 from batchpid.arrays.elementwise import TURN, namespace, tiny_of
 from batchpid.arrays.records import array_summary
+from batchpid.arrays.trees import mapped
 from batchpid.checks import instance
 from batchpid.law.params import PIDParams
 from batchpid.law.state import checked_dt
@@ -105,11 +106,11 @@ class Coefficients(NamedTuple):
         return array_summary(self)
 
 
-def discretise(params: PIDParams, dt: Array, num_envs: int | None = None) -> Coefficients:
+def discretise(params: PIDParams, dt: Array) -> Coefficients:
     """Return the law's coefficients at ``dt`` [s], for :func:`batchpid.advance`.
 
-    With ``num_envs`` they have the shape of :func:`spread`. Raises InvalidArgumentError for params
-    of another type, and unless dt is positive and finite; an array of JAX is not checked.
+    Raises InvalidArgumentError for params of another type, and unless dt is positive and finite; an
+    array of JAX is not checked.
     """
     instance("params", params, PIDParams, "build them with make_params")
     dt = checked_dt(dt)
@@ -125,7 +126,7 @@ def discretise(params: PIDParams, dt: Array, num_envs: int | None = None) -> Coe
     tracking = params.tracking_time
     same = {name: leaf for name, leaf in params._asdict().items() if name in Coefficients._fields}
     # Leaves that time does not scale keep their names.
-    k = Coefficients(
+    return Coefficients(
         **same,
         ki_dt=None if params.ki is None else params.ki * dt,
         ki_dt2=params.ki * dt * dt if implicit and params.ki is not None else None,
@@ -142,23 +143,16 @@ def discretise(params: PIDParams, dt: Array, num_envs: int | None = None) -> Coe
         turns=None if params.continuous is None else params.continuous / TURN,
         tiny=None if tau is None and tracking is None else tiny_of(params.dtype),
     )
-    if num_envs is None:
-        return k
-    return spread(k, num_envs)
 
 
 def spread(k: Coefficients, num_envs: int) -> Coefficients:
     """Return ``k`` with arrays of shape (num_envs, joints): NumPy then steps small batches twice as
     fast.
     """
-    # Masks and options that are off have no rows.
     xp = namespace(*k)
-    dtype = k.kp.dtype
-    zeros = xp.zeros((num_envs, k.kp.shape[-1]), dtype)
-    off = (type(None), tuple)
-    return Coefficients._make(
-        leaf if isinstance(leaf, off) else zeros + xp.asarray(leaf, dtype=dtype) for leaf in k
-    )
+    zeros = xp.zeros((num_envs, k.kp.shape[-1]), k.kp.dtype)
+    wide: Coefficients = mapped(lambda leaf: zeros + xp.asarray(leaf, dtype=zeros.dtype), k)
+    return wide
 
 
 def implicit_gains(params: PIDParams, dt: Array) -> tuple[Array, ...]:

@@ -16,13 +16,8 @@ on the straight line to its setpoint, however tight the limits. A joint whose pa
 exceeds its limit is clipped, and left out of s. While s < 1, conditional integration does not
 integrate further into the direction of a.
 
-A limit of the effort's rate scales the change of the effort as a whole, for the same reason::
-
-    effort = u' + z (u - u'),   z = the largest in [0, 1] with |z (u - u')| <= rate limit * dt in every joint
-
-with the last effort u'. Both efforts are within the limits, and so is each on the line between
-them. While z < 1, conditional integration does not integrate further into the direction of u -
-effort.
+A limit of the effort's rate holds each joint back by itself. Where it does, conditional integration
+does not integrate further into the direction of u - effort.
 
 A setpoint's acceleration r'' is added to the law's: u = M (a + r'') + passive force.
 
@@ -31,8 +26,6 @@ The time step limits the gains per mass matrix, unless the law is implicit
 """
 
 from __future__ import annotations
-
-from typing import Any
 
 from batchpid.arrays.array_types import Array, ArrayModule, Conditional, PerMassMatrix
 from batchpid.arrays.elementwise import clip, in_dtype_of, matrix_vector, namespace, row_minimum
@@ -148,9 +141,9 @@ def _to_effort(
         else:
             deeper = (share < 1) & (a * change > 0)
     if k.effort_step is not None:
-        # The change of the effort is scaled as a whole, for the same reason.
         reached = effort
-        effort = clip(_towards(reached, old.effort, k.effort_step, xp), low, high, xp)
+        effort = clip(reached, old.effort - k.effort_step, old.effort + k.effort_step, xp)
+        effort = clip(effort, low, high, xp)
         new = new._replace(effort=effort.copy())
         if change is None:
             late = None
@@ -160,28 +153,6 @@ def _to_effort(
     if deeper is not None:
         new = new._replace(integral=xp.where(deeper, old.integral, new.integral))
     return new, effort, unsaturated
-
-
-def _towards(
-    effort: Array,
-    last: Array,
-    step: Any,
-    xp: ArrayModule,
-) -> Array:
-    """Return the point nearest to ``effort`` on the line from ``last`` that no joint needs more
-    than ``step`` for.
-    """
-    change = effort - last
-    size = xp.abs(change)
-    late = size > step
-    part = row_minimum(xp.where(late, step / xp.where(late, size, 1.0), 1.0))
-    # Within the limit in spite of rounding, and exactly the effort where nothing is late.
-    return clip(
-        xp.where(part < 1, last + part * change, effort),
-        last - step,
-        last + step,
-        xp,
-    )
 
 
 def _share(

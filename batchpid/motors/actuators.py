@@ -3,10 +3,10 @@ r"""Parameters and state of actuators and sensors: build, broadcast, validate, s
 An effect that is off is ``None``: it is not a leaf and costs nothing. Every effect is declared
 once, with its unit, bounds and group, as a field of :class:`Actuators`.
 
-A file in YAML or JSON has one entry per joint, with the options of :func:`make_actuators`; a joint
+A file in YAML has one entry per joint, with the options of :func:`make_actuators`; a joint
 that is left out has ideal actuators (:class:`batchpid.io.documents.RecordFile`)::
 
-    format: batchpid-actuators-1
+    format: batchpid-actuators-2
     about: {robot: arm, log: chirp.csv}
     joints:
       shoulder: {command_delay: 0.0037, strength: 0.92, coulomb: 0.4, viscous: 1.1, armature: 0.02}
@@ -35,8 +35,8 @@ import numpy as np
 from batchpid.arrays.array_types import Array, Document, DType
 from batchpid.arrays.elementwise import clip, namespace, tiny_of
 from batchpid.arrays.field_tables import Field, declared, in_group
-from batchpid.arrays.records import LeafBuilder, Record, array_summary, with_fields
-from batchpid.checks import entries, integer, is_traced, number
+from batchpid.arrays.records import LeafBuilder, Record, with_fields
+from batchpid.checks import entries, integer, is_traced
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.documents import RecordFile
 
@@ -137,20 +137,14 @@ class Actuators(Record, _ActuatorsFields):
             options["continuous"] = self.continuous > 0
         if self.seed is not None:
             options["seed"] = int(self.seed[0, 0]) + (int(self.seed[0, 1]) << 32)
-        if self.max_delay is not None and not is_traced(self.max_delay):
-            options["max_delay"] = float(self.max_delay[0, 0])
+        options.pop("max_delay", None)
         if options:
             options["dtype"] = self.dtype
         return options
 
     def replace(self, **options: object) -> Actuators:
-        """Return actuators with some options of :func:`make_actuators` changed, checked as there.
-
-        With other delays max_delay is theirs, unless it is given too.
-        """
+        """Return actuators with some options of :func:`make_actuators` changed, checked as there."""
         present = self.options()
-        if not options.keys().isdisjoint(DELAYS):
-            present.pop("max_delay", None)
         # Traced numbers have a dtype.
         if any(is_traced(value) for value in options.values()):
             present.pop("dtype", None)
@@ -161,16 +155,12 @@ class Actuators(Record, _ActuatorsFields):
             )
         return make_actuators(**{"joints": self.num_joints, **present, **options})
 
-    def __repr__(self) -> str:
-        return array_summary(self._replace(seed=None))
-
 
 @with_fields(*ACTUATOR_FIELDS)
 def make_actuators(
     joints: int,
     *,
     seed: int = 0,
-    max_delay: float | None = None,
     continuous: Array = None,
     joint_names: Sequence[str] | None = None,
     dtype: DType = None,
@@ -188,7 +178,8 @@ def make_actuators(
     command_delay, sensor_delay
         Age of the command that the motor follows, and of the position and velocity that the
         controller sees, from 0 to 1 [s]. Any real number: values between two samples are
-        interpolated.
+        interpolated. Histories are as long as the largest delay of all envs, 1 s where a delay is
+        traced by JAX.
     lag
         Time constant T >= 0 of the effort's first-order lag [s].
     strength
@@ -224,10 +215,6 @@ def make_actuators(
         Standard deviation >= 0 of the Gaussian noise of each sample [rad or m, and per second].
     seed
         Seed of the noise, from 0 to 2^64 - 1.
-    max_delay
-        Length of the histories that delayed signals have [s]; None: the largest delay of all envs.
-        A longer one is needed where delays are to grow in flight: a delay beyond the history
-        returns its oldest sample. Where a delay is traced by JAX, None is 1 s, which is slow.
     continuous
         Bools: joints whose position is an angle modulo 2 pi [rad].
     joint_names
@@ -246,7 +233,7 @@ def make_actuators(
     if leaves["static"] is None and effects.get("static") is not None:
         leaves["stribeck"] = None
     _check_together(leaves, build.names)
-    longest = _longest_delay(leaves, max_delay)
+    longest = _longest_delay(leaves)
     words = integer("seed", seed, 0, 2**64 - 1)
     has_noise = any(leaves[name] is not None for name in NOISES)
     return Actuators(
@@ -283,27 +270,13 @@ def _check_together(leaves: Document, joint_names: Sequence[str] | None) -> None
         )
 
 
-def _longest_delay(leaves: Document, max_delay: float | None) -> float | None:
-    """Return the length of the histories [s]; None without delays.
-
-    Raises InvalidArgumentError for a delay above ``max_delay``.
-    """
-    delays = {name: leaves[name] for name in DELAYS if leaves[name] is not None}
-    longest = MAX_DELAY
-    if max_delay is not None:
-        longest = number("max_delay", max_delay, 0.0, MAX_DELAY, "seconds")
+def _longest_delay(leaves: Document) -> float | None:
+    """Return the length of the histories [s]; None without delays."""
+    delays = [leaves[name] for name in DELAYS if leaves[name] is not None]
     # A traced delay is not known; its history is as long as any delay may be.
-    most = {name: float(rows.max()) for name, rows in delays.items() if not is_traced(rows)}
-    for name, delay in most.items():
-        # The same number in float32 may be larger.
-        if delay > max(longest, float(delays[name].dtype.type(longest))):
-            remedy = f"use a number from 0 to {longest:g} (seconds)"
-            raise InvalidArgumentError(name, "out of range", value=delay, remedy=remedy)
-    if max_delay is None and len(most) == len(delays):
-        longest = max(most.values(), default=0.0)
-    if delays:
-        return longest
-    return None
+    return max(
+        (MAX_DELAY if is_traced(rows) else float(rows.max()) for rows in delays), default=None
+    )
 
 
 class _ActuatorStateFields(NamedTuple):
@@ -331,36 +304,12 @@ class ActuatorState(Record, _ActuatorStateFields):
     __slots__ = ()
     NAME = "state"
 
-    def __repr__(self) -> str:
-        return array_summary(self._replace(key=None, step=None))
-
-    def matched_to(self, fresh: ActuatorState) -> ActuatorState:
-        """Return this state with exactly the leaves of ``fresh``: missing ones from there, the
-        others dropped.
-
-        A history that is longer there is continued by its oldest sample. The key is taken from
-        ``fresh``.
-        """
-        matched = super().matched_to(fresh)
-        histories = {
-            name: _resized(leaf, getattr(fresh, name)) for name, leaf in matched.leaves().items()
-        }
-        return matched._replace(**histories | {"key": fresh.key})
-
-
-def _resized(old: Array, new: Array) -> Array:
-    """Return a history of the length of another; other arrays as they are."""
-    if old.ndim < 3 or old.shape == new.shape:
-        return old
-    # Before its oldest sample a signal is taken as constant.
-    return old[:, np.minimum(np.arange(new.shape[1]), old.shape[1] - 1)]
-
 
 ACTUATORS = RecordFile(
-    "batchpid-actuators-1",
+    "batchpid-actuators-2",
     Actuators,
     make_actuators,
-    ("dtype", "seed", "max_delay"),
+    ("dtype", "seed"),
     {**ACTUATOR_FIELDS, "continuous": Field(neutral=False)},
     partial=True,
 )

@@ -1,6 +1,6 @@
 """Parameters of plans: build, validate, save.
 
-A file in YAML or JSON has the options of the whole plan, and one entry per joint
+A file in YAML has the options of the whole plan, and one entry per joint
 (:class:`batchpid.io.documents.RecordFile`)::
 
     format: batchpid-plan-1

@@ -43,9 +43,8 @@ BOUNDS = declared(RunnerKeywords, Field)
 """Ranges of the options that are numbers."""
 NumEnvs = Annotated[int, BOUNDS["num_envs"], flag("Number of robots, one in each scene.")]
 GAINS_FLAG = flag(
-    "Gains: tuned, designed, sapien-tutorial, mjcf, drive, or a params file (.yaml"
-    " or .json) that `batchpid tune` or batchpid.save_params wrote. Default: tuned where the robot"
-    " has them, else designed.",
+    "Gains: tuned, designed, sapien-tutorial, mjcf, drive, or a params file (.yaml) that `batchpid"
+    " tune` or batchpid.save_params wrote. Default: tuned where the robot has them, else designed.",
     "NAME|FILE",
 )
 Gains = Annotated[str | None, GAINS_FLAG]
@@ -75,7 +74,7 @@ LOADING = {
     "actuators": Annotated[
         Path | None,
         flag(
-            "Motors and sensors: a file (.yaml or .json) of batchpid.save_actuators. Default: ideal"
+            "Motors and sensors: a file (.yaml) of batchpid.save_actuators. Default: ideal"
             " ones. Drives take their friction and armature alone.",
             "FILE",
         ),

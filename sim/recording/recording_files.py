@@ -174,9 +174,9 @@ def attributes(info: RunInfo) -> Document:
         if value is None or name == "description":
             continue
         if name == "params":
-            value = bp.dumps_params(value, info.joint_names, format="json")
+            value = bp.dumps_params(value, info.joint_names)
         elif name == "actuators":
-            value = bp.motors.dumps_actuators(value, info.joint_names, format="json")
+            value = bp.motors.dumps_actuators(value, info.joint_names)
         elif name in READERS:
             if isinstance(value, CommandSpec):
                 value = value.names, value.units

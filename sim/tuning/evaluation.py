@@ -371,8 +371,8 @@ def compare(
     Parameters
     ----------
     gains
-        Sets of gains: tuned, designed, sapien-tutorial, mjcf, drive,
-        params files (.yaml or .json) that `batchpid tune` or batchpid.save_params wrote. Default:
+        Sets of gains: tuned, designed, sapien-tutorial, mjcf, drive, params files (.yaml) that
+        `batchpid tune` or batchpid.save_params wrote. Default:
         tuned, sapien-tutorial and drive for a bundled robot, else designed and drive.
     moves
         Number of random moves, the tutorial's aside.

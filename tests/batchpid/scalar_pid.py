@@ -139,22 +139,18 @@ def step_of_robot(pids, dt, mass_matrix, inputs):
         room = pid.effort_max - more if wanted > 0 else more - pid.effort_min
         if 0 < room < abs(wanted):
             share = min(share, room / abs(wanted))
-    # And the largest share of the change that no joint needs longer than a step for.
     reached = [
         within(share * wanted + more, pid.effort_min, pid.effort_max)
         for pid, wanted, more in zip(pids, demand, added, strict=True)
     ]
-    changes = [goal - pid.effort for pid, goal in zip(pids, reached, strict=True)]
-    part = 1.0
-    for pid, change in zip(pids, changes, strict=True):
-        if abs(change) > pid.effort_rate_limit * dt:
-            part = min(part, pid.effort_rate_limit * dt / abs(change))
     efforts = []
-    for pid, acceleration, change, goal in zip(pids, accelerations, changes, reached, strict=True):
-        effort = within(pid.effort + part * change, pid.effort_min, pid.effort_max)
+    for pid, acceleration, goal in zip(pids, accelerations, reached, strict=True):
+        change = pid.effort_rate_limit * dt
+        effort = within(goal, pid.effort - change, pid.effort + change)
+        effort = within(effort, pid.effort_min, pid.effort_max)
         moved = within(pid.integral, pid.integral_min, pid.integral_max) - pid.before
         is_short = share < 1 and acceleration * moved > 0
-        pid.settle(effort, is_short or (part < 1 and (goal - effort) * moved > 0))
+        pid.settle(effort, is_short or (goal - effort) * moved > 0)
         efforts.append(effort)
     return efforts
 

@@ -41,22 +41,3 @@ def test_a_delay_in_float32_is_not_above_the_longest():
     motors = bp.make_actuators(2, command_delay=0.004)
     share = jax.vmap(lambda strength: motors.replace(strength=strength).strength[0])
     assert share(jax.numpy.ones((3, 2), "float32")).shape == (3, 2)
-
-
-def test_a_longer_delay_in_flight_keeps_the_history():
-    short, long = (bp.make_actuators(1, command_delay=steps * DT) for steps in (2, 4))
-    q = np.zeros((1, 1))
-    state = bp.motors.init(short, q, DT)
-
-    def delivered(actuators, state, steps):
-        k = bp.motors.discretise(actuators, state, DT)
-        for step in steps:
-            state, effort = bp.motors.advance_effort(k, state, q + step, q)
-        return state, effort
-
-    state, effort = delivered(short, state, range(6))
-    assert effort == 3.0
-    state = state.matched_to(bp.motors.init(long, q, DT))
-    state, effort = delivered(long, state, [6])
-    assert effort == 2.0, "the oldest that is known"
-    assert delivered(long, state, range(7, 12))[1] == 7.0

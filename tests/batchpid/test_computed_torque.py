@@ -27,9 +27,7 @@ def params(joints, **options):
 
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**31), envs=st.integers(1, 4), joints=st.integers(1, 5))
-def test_limits_keep_the_direction_of_the_acceleration_and_of_the_change_of_the_effort(
-    seed, envs, joints
-):
+def test_limits_keep_the_direction_of_the_acceleration(seed, envs, joints):
     rng = np.random.default_rng(seed)
     matrix, passive = mass(rng, envs, joints), rng.uniform(-1, 1, (envs, joints))
     limit = rng.uniform(1.1, 10.0 ** rng.integers(1, 6), joints)
@@ -56,10 +54,7 @@ def test_limits_keep_the_direction_of_the_acceleration_and_of_the_change_of_the_
     assert (np.isclose(np.abs(limited), limit).any(1) == short).all()
     changed = efforts(effort_limit=limit, effort_rate_limit=rate)
     assert (np.abs(changed) <= limit).all()
-    late = share(changed - last, limited - last)
-    step = np.abs(changed - last) / (rate * DT)
-    assert (step <= 1 + 1e-9).all()
-    assert (np.isclose(step, 1).any(1) == late).all()
+    np.testing.assert_allclose(changed, np.clip(limited, last - rate * DT, last + rate * DT))
 
 
 def test_back_calculation_of_accelerations_is_refused():

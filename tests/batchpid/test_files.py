@@ -37,7 +37,7 @@ def test_a_pipe_or_device_is_not_replaced(tmp_path):
 
 
 def test_a_write_that_fails_leaves_the_older_file(tmp_path, monkeypatch):
-    path = tmp_path / "file.json"
+    path = tmp_path / "file.yaml"
     bp.save_params(path, PARAMS, ["a"])
     older = path.read_bytes()
 

@@ -8,6 +8,7 @@ from hypothesis.extra import numpy as npst
 from law_cases import DT, ENVS, JOINTS, OPTIONS
 
 import batchpid as bp
+from batchpid.law.coefficients import spread
 
 numbers = st.floats(-1e3, 1e3, allow_subnormal=False)
 runs = st.tuples(*[npst.arrays(float, (6, ENVS, JOINTS), elements=numbers)] * 3)
@@ -51,7 +52,7 @@ def test_the_integral_is_bounded_by_anti_windup(strategy):
 
 @given(cases, runs, st.integers(1, ENVS - 1), st.booleans())
 @settings(max_examples=25)
-def test_sharding_envs_changes_no_bit(case, run, cut, spread):
+def test_sharding_envs_changes_no_bit(case, run, cut, is_spread):
     params = bp.make_params(JOINTS, **OPTIONS[case])
     whole = bp.init(params, run[1][0])
     shards = (slice(cut), slice(cut, None))
@@ -61,9 +62,8 @@ def test_sharding_envs_changes_no_bit(case, run, cut, spread):
             bp.discretise(params, DT), whole, run[0][t], run[1][t], feedforward=run[2][t]
         )
         for n, rows in enumerate(shards):
-            k = bp.discretise(
-                params.for_envs(rows), DT, len(terms.effort[rows]) if spread else None
-            )
+            k = bp.discretise(params.for_envs(rows), DT)
+            k = spread(k, len(terms.effort[rows])) if is_spread else k
             inputs = [x[t][rows] for x in run]
             parts[n], part = bp.advance(k, parts[n], *inputs[:2], feedforward=inputs[2])
             assert part.effort.tobytes() == terms.effort[rows].tobytes()

@@ -47,6 +47,6 @@ def test_every_module_but_the_backends_of_jax_can_be_imported_with_numpy_alone()
 def test_params_go_to_json_and_back_with_numpy_alone():
     run(
         "import batchpid as bp\n"
-        "text = bp.dumps_params(bp.make_params(2, 1.0), ['a', 'b'], format='json')\n"
+        "text = bp.dumps_params(bp.make_params(2, 1.0), ['a', 'b'])\n"
         "assert bp.loads_params(text)[1] == ['a', 'b']\n"
     )

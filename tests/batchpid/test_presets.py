@@ -38,5 +38,6 @@ def test_tutorial(path, kp, ki, kd):
         integral += (r - y) * DT
         expected.append(kp * (r - y) + ki * integral + kd * (r - y - last) / DT)
         last = r - y
-    found = run(bp.presets.tutorial(1, kp + ki * DT, ki, kd), path, kicks=True)
+    params = bp.make_params(1, kp + ki * DT, ki, kd, setpoint_weight_derivative=1.0)
+    found = run(params, path, kicks=True)
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-8)

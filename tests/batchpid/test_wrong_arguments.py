@@ -105,7 +105,6 @@ COMBINATIONS = {
         },
     ],
     bp.make_actuators: [
-        {"sensor_delay": 0.01, "max_delay": 0.005},
         {"static": 0.1, "coulomb": [0.1, 0.2]},
         {"no_load_speed": ..., "saturation_effort": 10.0},
         {"saturation_effort": ..., "no_load_speed": 10.0},
@@ -147,7 +146,6 @@ COMBINATIONS = {
     bp.track: [{"ki": ..., "params": bp.make_params(2, 1.0)}],
     batchpid.export.to_c: [
         {"params": bp.make_params(2, np.ones((2, 2)))},
-        {"inputs": (), "params": bp.make_params(2, 1.0, measurement_rate="measured")},
         {"inputs": ("velocity",)},
         {"prefix": "a-b"},
         {"tree": planar((1.0,))},
@@ -358,11 +356,7 @@ def test_an_unknown_option_is_answered_with_the_nearest():
             "'effort_limit'"
             in refused("efort_limit", function, **needed(function), efort_limit=3.0).remedy
         )
-    for function in (
-        params.replace,
-        actuators.replace,
-        lambda **options: bp.presets.tutorial(2, **options),
-    ):
+    for function in (params.replace, actuators.replace):
         assert "'effort_limit'" in refused("efort_limit", function, efort_limit=3.0).remedy
     assert "joints, kp, ki, kd" in refused("zzzzzzz", bp.make_params, 2, kp=1.0, zzzzzzz=1).remedy
 
@@ -371,14 +365,13 @@ def test_an_unknown_option_is_answered_with_the_nearest():
 # --------------------------------------------------------------------------------------------------
 
 PID = '{"format": "batchpid-params-2", "joints": {"elbow": {%s}}}'
-MOTOR = "format: batchpid-actuators-1\njoints: {elbow: {%s}}"
+MOTOR = "format: batchpid-actuators-2\njoints: {elbow: {%s}}"
 TEXTS = [
-    *((text, "text", None) for text in ("", '{"joints": {}}', "[1, 2]", '{"format": "batchpid')),
+    *((text, "text", None) for text in ('{"joints": {}}', "[1, 2]", '{"format": "batchpid')),
     ('{"format": "batchpid-params-2", "joint": {}}', "key", None),
     ('{"format": "batchpid-params-2", "joints": {}}', "joints", None),
     (PID % '"kd": 1.0', "joints", "elbow"),
     (PID % '"kp": 1.0, "kq": 2.0', "kq", "elbow"),
-    (PID % '"kp": 1.0, "kp": 2.0', "text", None),
     *((PID % f'"kp": {value}', "kp", "elbow") for value in ("-1.0", '"nan"', "true", "[]")),
     (PID % f'"kp": 1{"0" * 400}', "kp", "elbow"),
     (
@@ -392,12 +385,11 @@ TEXTS = [
         None,
     ),
     ('{"format": "batchpid-params-2", "about": 3, "joints": {"a": {"kp": 1.0}}}', "about", None),
-    ("format: batchpid-params-2\njoints: {elbow: {kp: 1}}", "text", None),
     (MOTOR % "kp: 1", "kp", "elbow"),
     (MOTOR % "strength: strong", "strength", "elbow"),
-    ("format: batchpid-actuators-1\njoints: {shoulder: {}}", "text", None),
-    ("format: batchpid-actuators-1\njoints: {elbow: [1]}", "joints", "elbow"),
-    ("format: batchpid-actuators-1\nseed: soon\njoints: {elbow: {}}", "seed", None),
+    ("format: batchpid-actuators-2\njoints: {shoulder: {}}", "text", None),
+    ("format: batchpid-actuators-2\njoints: {elbow: [1]}", "joints", "elbow"),
+    ("format: batchpid-actuators-2\nseed: soon\njoints: {elbow: {}}", "seed", None),
     *((text, "text", None) for text in ("- 1", "format: [")),
 ]
 """Text of params or of actuators, the key that is wrong, and its joint."""
@@ -405,20 +397,15 @@ TEXTS = [
 
 @pytest.mark.parametrize(("text", "key", "joint"), TEXTS, ids=range(len(TEXTS)))
 def test_texts(text, key, joint, tmp_path):
-    """As a text and as a file, whose error names the file."""
-    is_motor = (
-        "actuators" in text or text in ("- 1", "format: [") or text.endswith("{elbow: {kp: 1}}")
-    )
-    read, load = (
-        (motors.loads_actuators, bp.load_actuators)
-        if is_motor
-        else (bp.loads_params, bp.load_params)
-    )
-    names = [["elbow"]] if is_motor else []
-    assert refused(key, read, text, *names).joint == joint
-    for suffix in (".yaml", ".json")[: 1 if is_motor else 2]:
-        (path := tmp_path / f"file{suffix}").write_text(text)
-        assert str(path) in str(refused(str(path) if key == "text" else key, load, path, *names))
+    """As a file, whose error names it; as a text, if it is JSON."""
+    load = bp.load_actuators if "actuators" in text else bp.load_params
+    names = [["elbow"]] if "actuators" in text else []
+    if text[0] in "{[":
+        assert refused(key, bp.loads_params, text, *names).joint == joint
+    (path := tmp_path / "file.yaml").write_text(text)
+    error = refused(str(path) if key == "text" else key, load, path, *names)
+    assert str(path) in str(error)
+    assert error.joint == joint
 
 
 def arrays(value):

@@ -62,9 +62,6 @@ KINDS = {
     "params.yaml": Kind(
         lambda path: bp.save_params(path, PARAMS, JOINTS), lambda path: bp.load_params(path, JOINTS)
     ),
-    "params.json": Kind(
-        lambda path: bp.save_params(path, PARAMS, JOINTS), lambda path: bp.load_params(path, JOINTS)
-    ),
     "motors.yaml": Kind(
         lambda path: bp.save_actuators(path, MOTORS, JOINTS),
         lambda path: bp.load_actuators(path, JOINTS),

@@ -104,7 +104,6 @@ def test_it_compiles_as_cpp_and_neither_allocates_nor_keeps_global_state(tmp_pat
         "  every_init(a, x); every_reset(a, x); every_step(a, x, x, x, x);\n"
         "  matrix_init(b, x); matrix_reset(b, x); matrix_step(b, x, x, x, x, x); }\n"
         "void use(double *x) {\n"
-        "  batchpid_controller arm(x); arm.step(x, x, x, x); arm.reset(x);\n"
         "  batchpid_mass_matrix(x, x + 2); batchpid_bias(x, x, x); }\n"
     )
     subprocess.run(["g++", *STRICT, "-O2", "-c", "law.cpp"], cwd=tmp_path, check=True)

@@ -27,7 +27,7 @@ class Law:
         return bp.init(self.params, np.tile(robot.start, (num_envs, 1)).astype(np.float32))
 
     def __call__(self, state, setpoint, qpos, qvel, passive):
-        k = bp.discretise(self.params, 1 / 2000, len(qpos))
+        k = bp.discretise(self.params, 1 / 2000)
         state, terms = bp.advance(k, state, setpoint, qpos, None, None, passive)
         return state, terms.effort
 

@@ -59,7 +59,7 @@ def test_a_robot_has_the_actuators_of_its_file(panda, tmp_path):
         name: {"strength": 0.9, "command_delay": 0.001, "coulomb": 0.1}
         for name in panda.joint_names[:7]
     }
-    path.write_text(json.dumps({"format": "batchpid-actuators-1", "joints": arm}))
+    path.write_text(json.dumps({"format": "batchpid-actuators-2", "joints": arm}))
     robot, table = Robot.load("panda", actuators=path), commands(panda, 3)
     assert robot.actuators.strength.tolist() == [[0.9] * 7 + [1.0] * 2]
     with Runner(robot, N, workers=0) as runner:
