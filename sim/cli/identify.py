@@ -105,15 +105,15 @@ def identify_logs(
         Compensation | None,
         flag(
             "Forces that the robot compensates: gravity+coriolis+friction, gravity+coriolis, gravity"
-            " or none. Default: as the recordings say, else gravity+coriolis+friction."
+            " or none. Default: as a recording says, else gravity+coriolis+friction."
         ),
     ] = None,
     timestep: Annotated[
         float | None,
         Field("s", low=1e-5, high=0.01),
         flag(
-            "Time step of the control that drove the robot [s]. Default: as the recordings say, else"
-            " the period of the rows up to 2.5 ms, or a part of a longer one of at most 0.5 ms."
+            "Time step of the control that drove the robot [s]. Default: as a recording says, else the"
+            " period of the rows up to 2.5 ms, or a part of a longer one of at most 0.5 ms."
         ),
     ] = None,
     hold: Annotated[

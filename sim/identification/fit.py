@@ -48,7 +48,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
-from batchpid.sim.identification.regression import bounded_solution
 from batchpid.sim.identification.unknowns import SENDER, Problem, kinds_of, size_of
 
 OUTLIER = 2.0
@@ -240,11 +239,14 @@ def bounded_step(
     high: Float64,
 ) -> tuple[Float64, float]:
     """Return the damped step within bounds, and the decrease of the cost that it promises."""
+    from scipy import optimize
+
     residual, slopes = triangle[:, 0], triangle[:, 1:]
     ridge = np.diag(np.sqrt(damping) * np.linalg.norm(slopes, axis=0))
     rows = np.vstack([slopes, ridge])
     target = -np.append(residual, np.zeros(len(ridge)))
-    step = bounded_solution(rows, target, low, high)
+    # The solution may lie beyond a bound by its last bit.
+    step = np.clip(optimize.lsq_linear(rows, target, (low, high), method="bvls").x, low, high)
     decrease = target @ target - ((rows @ step - target) ** 2).sum()
     return step, 0.5 * float(decrease)
 
@@ -402,7 +404,7 @@ def _with_effect(result: Fit, solver: partial[Fit]) -> Fit:
     zero = np.zeros(len(unknowns.joints))
     kinds = [kind for effect in effects for kind in kinds_of(effect)]
     wider = unknowns.adding(kinds, {"load_friction": zero, "static": zero})
-    wide = replace(problem.coarse(judged=True), unknowns=wider)
+    wide = replace(problem.coarse(), unknowns=wider)
     count = len(present)
     point = np.append(result.point, wider.start[count:])
     changes = inward(point, FIRST_CHANGE * np.eye(len(point)), *wider.bounds)

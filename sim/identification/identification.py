@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
+from importlib.util import find_spec
 from multiprocessing import get_context
 from typing import Any, get_args
 
@@ -16,7 +17,7 @@ import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.arrays.elementwise import TURN
 from batchpid.checks import choice, flag, instance, integer, number
-from batchpid.errors import InvalidArgumentError
+from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.sim.identification.fit import fit
 from batchpid.sim.identification.log import CommandKind, Log, checked
 from batchpid.sim.identification.log_files import read_logs
@@ -82,12 +83,12 @@ def identify(
         separate settings.
     params
         Params of the PID law that drove the robot, of all its joints or of those in the logs: the
-        setpoints of the logs are used. None: the params of a recording, or the logged efforts.
+        setpoints of the logs are used. None: the params of a log, or the logged efforts.
     compensate
         Forces that the robot compensates by itself, or "none", as for logs of the complete efforts.
-        Default: as the recordings say, else "gravity+coriolis+friction".
+        Default: as a recording says, else "gravity+coriolis+friction".
     timestep
-        Time step of the control that drove the robot [s]. Default: as the recordings say, else the
+        Time step of the control that drove the robot [s]. Default: as a recording says, else the
         period of the rows up to 2.5 ms, or a part of a longer one of at most 0.5 ms.
     hold
         True if the commands of CSV files hold from row to row, False to interpolate between rows.
@@ -108,12 +109,19 @@ def identify(
     Raises
     ------
     InvalidArgumentError
-        An option is out of range or contradicts a recording, a file holds no log of this robot, or
-        setpoints were logged late.
+        An option is out of range, a file holds no log of this robot, or setpoints were logged late.
+    MissingDependencyError
+        SciPy is not installed.
     """
+    if find_spec("scipy") is None:
+        raise MissingDependencyError("scipy", "identification", "tune")
     instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")
     kinds = [choice("extras", name, EXTRAS) for name in dict.fromkeys(extras)]
     evaluations = integer("evaluations", evaluations, 2, 1000)
+    if timestep is not None:
+        timestep = number("timestep", timestep, 1e-5, 0.01, "seconds")
+    if compensate is not None:
+        choice("compensate", compensate, get_args(Compensation))
     places: list[str | None] = [None]
     if flag("payload", payload):
         kinds.append("payload")
@@ -207,11 +215,6 @@ def _prepared(
     """Return the robot with its still joints at their mean positions, and the moving joints of each
     log with plant and control.
     """
-    recorded = [log.compensate for log in logs]
-    forces = _option("compensate", compensate, recorded, "gravity+coriolis+friction")
-    compensated = choice("compensate", forces, get_args(Compensation)).split("+")
-    dt = _option("timestep", timestep, [log.timestep for log in logs], _own_timestep(logs[0]))
-    dt = number("timestep", dt, 1e-5, 0.01, "seconds")
     # Joints that did not move are held at their mean position, with the unlogged ones.
     qpos = np.concatenate([log.qpos for log in logs])
     joints = np.array(logs[0].joints)
@@ -222,25 +225,24 @@ def _prepared(
     qpos = qpos[:, moves]
     free = (qpos.min(0) < robot.lower[joints]) | (qpos.max(0) > robot.upper[joints])
     # A Runner compensates the friction of the description and of the robot's motors, too.
-    modelled = {}
     friction = (robot.friction + known_joints(robot)["coulomb"])[joints]
-    if "friction" in compensated and friction.any():
-        band = np.array([FRICTION_BAND[robot.units[joint]] for joint in joints])
-        turns = robot.continuous[joints] / TURN
-        modelled = {"modelled": friction, "band": band, "turns": turns}
+    band = np.array([FRICTION_BAND[robot.units[joint]] for joint in joints])
+    modelled = {"modelled": friction, "band": band, "turns": robot.continuous[joints] / TURN}
     plants = dict[Robot, LogPlant]()
     data = list[LogData]()
     for log in logs:
         law = _law(robot, log, params)
+        forces = compensate or log.compensate or "gravity+coriolis+friction"
+        dt = timestep or log.timestep or _own_timestep(log)
         drive = Control(
             timestep=dt,
             envs=1,
             coupling=robot.coupling,
             params=bp.PIDParams(kp=None) if law is None else law.for_joints(moves),
             mode="effort" if law is None else "pid",
-            gravity="gravity" in compensated,
-            coriolis="coriolis" in compensated,
-            **modelled,
+            gravity="gravity" in forces,
+            coriolis="coriolis" in forces,
+            **(modelled if "friction" in forces and friction.any() else {}),
         )
         key = log.robot or robot
         if key not in plants:
@@ -265,47 +267,24 @@ def _resting(robot: Robot, start: Float64) -> Robot:
     return replace(robot, settings=None, source=robot.source._replace(start=start))
 
 
-def _option(
-    name: str,
-    value: Any,
-    recorded: list[Any],
-    default: Any,
-) -> Any:
-    """Return ``value``, else the recordings' one, else the default."""
-    values = {option for option in (value, *recorded) if option is not None} or {default}
-    if len(values) > 1:
-        problem = f"contradicts recordings, which were made with {recorded}"
-        raise InvalidArgumentError(
-            name, problem, value=value, remedy="leave it out, or fit them one by one"
-        )
-    return values.pop()
-
-
 def _law(robot: Robot, log: Log, params: bp.PIDParams | None) -> bp.PIDParams | None:
     """Return the params that drove a log, of its joints, one row; None for efforts."""
-    laws = list[bp.PIDParams]()
-    for law in (params, log.params):
-        if law is not None and law.num_joints != len(log.joints):
-            if law.num_joints != robot.dof or law.num_envs != 1:
-                problem = f"hold {law.num_joints} joints of {law.num_envs} envs"
-                remedy = f"give one gain for each of the robot's {robot.dof} joints"
-                raise InvalidArgumentError("params", problem, remedy=remedy)
-            law = law.for_joints(list(log.joints))
-        if law is not None:
-            laws.append(law)
-    if bool(laws) != (log.kind == "setpoint"):
-        remedy = "give no params" if laws else "give the params that drove the robot"
+    law = log.params if params is None else params
+    if (law is None) == (log.kind == "setpoint"):
+        remedy = "give no params" if law is not None else "give the params that drove the robot"
         raise log.error(f"holds {log.kind}s", remedy)
-    for name in ("kp", "ki", "kd"):
-        gains = [0.0 if getattr(law, name) is None else getattr(law, name) for law in laws]
-        if not np.allclose(gains[:1], gains[-1:], rtol=1e-6):
-            problem = f"contradict {log.source}, which was recorded with another {name}"
-            remedy = "leave them out, and give params to logs without"
+    if law is None:
+        return None
+    if law.num_joints != len(log.joints):
+        if law.num_joints != robot.dof or law.num_envs != 1:
+            problem = f"hold {law.num_joints} joints of {law.num_envs} envs"
+            remedy = f"give one gain for each of the robot's {robot.dof} joints"
             raise InvalidArgumentError("params", problem, remedy=remedy)
-    if laws and laws[-1].gain_units is not None:
+        law = law.for_joints(list(log.joints))
+    if law.gain_units is not None:
         problem = "have gains per inertia or mass matrix, which a fit does not simulate"
         raise InvalidArgumentError("params", problem, remedy="log the efforts, and give no params")
-    return laws[-1] if laws else None
+    return law
 
 
 def _regress(data: list[LogData]) -> tuple[list[LogData], Guess]:
@@ -315,7 +294,7 @@ def _regress(data: list[LogData]) -> tuple[list[LogData], Guess]:
     Raises InvalidArgumentError where setpoints acted before they were logged.
     """
     guess = regress(_fitted(data))
-    if data[0].drive.gravity:
+    if any(part.drive.gravity for part in data):
         # A robot that adds the compensation by itself may do so exactly, whatever its motors.
         none = np.zeros(data[0].plant.joints)
         exact = []

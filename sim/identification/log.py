@@ -134,13 +134,16 @@ def checked(robot: Robot, log: Log, resets: Sequence[int] = ()) -> list[Log]:
     Raises
     ------
     InvalidArgumentError
-        A value is not finite, times decrease, there are too few rows, or positions are in another
-        unit.
+        A value is not finite, times do not increase, there are too few rows, or positions are in
+        another unit.
     """
     _check_finite(robot, log)
     if log.is_checked:
         return [log]
-    log = _in_order(log)
+    late = np.diff(log.time) <= 0
+    if late.any():
+        row = log.place(np.argmax(late) + 1)
+        raise log.error(f"{row}: time does not increase", "sort the rows, and remove repeated ones")
     period = float(np.median(np.diff(log.time))) if len(log.time) > 1 else 0.0
     if period > LONGEST_PERIOD:
         problem = f"has one row per {period:.3g} s, too few to see friction and delay"
@@ -176,19 +179,6 @@ def _check_finite(robot: Robot, log: Log) -> None:
             name = ":".join([quantity, *joints])
             problem = f"{log.place(row)}, column {name!r} is empty or not finite"
             raise log.error(problem, "remove the row")
-
-
-def _in_order(log: Log) -> Log:
-    """Return ``log`` without rows that repeat a time."""
-    steps = np.diff(log.time, prepend=-np.inf)
-    if (steps < 0).any():
-        raise log.error(f"{log.place(np.argmax(steps < 0))}: time decreases", "sort the rows")
-    repeats = steps == 0
-    if not repeats.any():
-        return log
-    first = log.place(np.argmax(repeats))
-    log = log.with_remark(f"{repeats.sum()} rows repeat a time, the first at {first}: left out")
-    return log.part(~repeats, np.diff(log.command_time, prepend=-np.inf) > 0)
 
 
 def _between(log: Log, begin: int, end: int) -> Log:

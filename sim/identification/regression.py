@@ -77,24 +77,15 @@ def _cutoff(log: Log) -> float:
 
 
 def lowpass(table: Float64, cutoff: float, timestep: float) -> Float64:
-    """Return the columns of a table (steps, columns) without frequencies f above ``cutoff`` [Hz],
-    without phase lag: a Butterworth filter of order 4, forwards and backwards, whose gain is
-    1 / (1 + (f / cutoff)^8).
+    """Return the columns of a table (steps, columns) without frequencies above ``cutoff`` [Hz],
+    without phase lag: a Butterworth filter of order 4, forwards and backwards.
     """
-    # Less the line between its ends, and with its odd reflection, a column is smoothly periodic.
-    # The transform of a length with large prime factors takes ten times as long: rows are added by
-    # odd reflection at the end.
-    count = len(table) - 1
-    length = min(factor << max(-(-count // factor) - 1, 0).bit_length() for factor in (4, 5, 6, 7))
-    added = 2 * table[-1] - table[max(2 * count - length, 0) : -1][::-1]
-    longer = np.concatenate([table, added])
-    line = np.linspace(longer[0], longer[-1], len(longer))
-    rest = longer - line
-    period = np.concatenate([rest, -rest[-2:0:-1]])
-    frequency = np.fft.rfftfreq(len(period), timestep)[:, None]
-    spectrum = np.fft.rfft(period, axis=0) / (1 + (frequency / cutoff) ** 8)
-    filtered = np.fft.irfft(spectrum, len(period), axis=0)
-    return np.ascontiguousarray((line + filtered[: len(line)])[: len(table)])
+    from scipy import signal
+
+    sections = signal.butter(4, cutoff, fs=1 / timestep, output="sos")
+    # The filter settles on an odd extension of the ends.
+    added = min(round(EDGE_SECONDS / timestep), len(table) - 1)
+    return np.asarray(signal.sosfiltfilt(sections, table, 0, padlen=added), float)
 
 
 def regress(data: Sequence[LogData]) -> Guess:
@@ -210,6 +201,8 @@ def _solve(table: Sequence[Float64]) -> list[float]:
     ``table`` has (rows,) the effort that the links need, acceleration, speed, its sign, and the
     effort of the motor.
     """
+    from scipy import optimize
+
     target, *motion, effort = table
     columns: Any = np.stack([*(-column for column in motion), effort, target], axis=1)
     # The bias is the mean of what is left, so that the others are found without it.
@@ -221,47 +214,8 @@ def _solve(table: Sequence[Float64]) -> list[float]:
     prior = np.sqrt(len(target)) * weight * size[3] + 1e-12
     rows = np.vstack([columns, [0.0, 0.0, 0.0, prior, prior]])
     triangle: Any = np.linalg.qr(rows / np.append(size[:4], 1.0), mode="r")
-    least = np.zeros(4)
-    values = bounded_solution(triangle[:, :4], triangle[:, 4], least, least + np.inf) / size[:4]
+    values = optimize.nnls(triangle[:, :4], triangle[:, 4])[0] / size[:4]
     residual = columns[:, 4] - columns[:, :4] @ values
     bias = center[4] - center[:4] @ values
     motor = (values[3] * size[3]) ** 2 + 1e-3 * size[4] ** 2
     return [*values, bias, float(np.log((residual**2).mean() / motor + 1e-12))]
-
-
-def bounded_solution(
-    rows: Float64,
-    target: Float64,
-    low: Float64,
-    high: Float64,
-) -> Float64:
-    """Return the x (n,) between ``low`` <= 0 and ``high`` >= 0 that minimises |rows x - target|.
-
-    From 0 on, x goes to the minimum over its free entries, or to the first bound in between, whose
-    entry is then held; at a minimum the entry is freed that the gradient drives off its bound the
-    most (P. B. Stark and R. L. Parker, "Bounded-variable least squares", 1995).
-    """
-    x = np.zeros(len(low))
-    free = np.ones(len(low), bool)
-    for _ in range(10 * len(x)):
-        aim = x.copy()
-        rest = target - rows[:, ~free] @ x[~free]
-        aim[free] = np.linalg.lstsq(rows[:, free], rest, rcond=None)[0]
-        ends = np.clip(aim, low, high)
-        beyond = ends != aim
-        if beyond.any():
-            steps = np.full(len(x), np.inf)
-            steps[beyond] = ((ends - x)[beyond] / (aim - x)[beyond]).clip(0.0)
-            first = steps == steps.min()
-            x += steps.min() * (aim - x)
-            x[first] = ends[first]
-            free &= ~first
-            continue
-        x = aim
-        push = rows.T @ (target - rows @ x)
-        inward = ~free & np.where(x <= low, push > 0, push < 0)
-        size = np.linalg.norm(rows, axis=0) * np.linalg.norm(target)
-        if not (np.abs(push)[inward] > 1e-12 * size[inward]).any():
-            break
-        free[np.argmax(np.abs(push) * inward)] = True
-    return x

@@ -8,7 +8,7 @@ import os
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import compress
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,9 +27,6 @@ from batchpid.sim.identification.unknowns import (
 )
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.robot_options import load_robot_actuators
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 WHOLE_ROBOT = "robot"
 """Place of unknowns of the whole robot."""
@@ -244,23 +241,6 @@ class Identification:
             "remarks": self.remarks,
             "identified_from": [part.log.source for part in self.fit.problem.data],
         }
-
-    def figure(self) -> Figure:
-        """Return a picture of the position errors along the first log, before and after."""
-        from batchpid.sim import plots
-
-        windows = [window for window in self.fit.problem.windows if window.log == 0]
-        tables = []
-        for problem in (self._described, self.fit.problem):
-            point = self.fit.point[: len(problem.unknowns.entries)]
-            tables.append(problem.evaluate(windows, point, free_states=False))
-        errors = []
-        for window, before, after in zip(windows, *tables, strict=True):
-            errors.append((window.time, window.fitted, before[..., 0], after[..., 0]))
-        robot = self.unknowns.robot
-        units = [robot.units[joint] for joint in self.unknowns.joints]
-        title = f"{robot.name}: position error, shaded where it was not fitted"
-        return plots.fit_errors(errors, self.joint_names, units, title)
 
     def report(self) -> str:
         """Return estimates, errors and remarks as text."""

@@ -94,13 +94,6 @@ class Stretch(NamedTuple):
     fitted: Any = None
     """Fitted rows; the others are held out (rows,) bool."""
 
-    def until(self, step: int) -> Stretch:
-        """Return the rows that end before a sim step."""
-        rows = self.step < step
-        names = ("step", "before", "measured", "time", "fitted")
-        parts = {name: getattr(self, name)[rows] for name in names}
-        return self._replace(command=self.command[: self.past + step], **parts)
-
 
 @dataclass(frozen=True)
 class Lag(Stage):

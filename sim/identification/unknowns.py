@@ -28,8 +28,6 @@ from batchpid.sim.robot.robot import Robot
 
 FEWER, LEAST_WINDOWS = 4, 12
 """Stride of the windows in the first steps of a fit, and the least number that it must leave."""
-BEGINNING = 4.0
-"""Length of a log of setpoints for the first steps of a fit [s]."""
 ENVS = 1024
 """Most simulations at once."""
 STATE_STEPS = 1e-3, 1e-2
@@ -324,19 +322,11 @@ class Problem:
             return 0.0
         return max(float(np.median(np.diff(log.command_time))) - drive.timestep, 0.0) / 2
 
-    def coarse(self, judged: bool = False) -> Problem:
-        """Return the problem with every FEWER-th window, or with the beginnings of logs of
-        setpoints, for the first steps of a fit; itself where logs are short.
-
-        A ``judged`` problem has held-out rows.
+    def coarse(self) -> Problem:
+        """Return the problem with every FEWER-th window, for the first steps of a fit; itself where
+        windows are few.
         """
         windows = self.windows[::FEWER]
-        if self.data[0].drive.mode == "pid":
-            most = round(BEGINNING / self.data[0].drive.timestep)
-            longest = max(len(window.command) for window in self.windows)
-            if judged or longest < 2 * most:
-                return self
-            return replace(self, windows=[window.until(most) for window in self.windows])
         return replace(self, windows=windows) if len(windows) >= LEAST_WINDOWS else self
 
     def evaluate(

@@ -2,14 +2,12 @@
 
 from batchpid.sim.plots.figures import (
     FORMATS,
-    fit_errors,
     save,
     step_responses,
 )
 
 __all__ = [
     "FORMATS",
-    "fit_errors",
     "save",
     "step_responses",
 ]

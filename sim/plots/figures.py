@@ -1,4 +1,4 @@
-"""Figures of runs: responses of one run or of two, and errors of an identification.
+"""Figures of runs: responses of one run or of two.
 
 Everything is drawn by Matplotlib's object interface on the Agg and SVG canvases: no display, no
 global state. Every artist with a meaning has a label, from which the legend is made.
@@ -19,9 +19,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Float64, Rows
+from batchpid.arrays.array_types import Rows
 from batchpid.checks import choice, file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
@@ -107,51 +106,6 @@ def step_responses(
         if pose is not None and entry < pose.shape[-1]:
             _draw_fan(above, run.time, pose[..., entry])
         below.remove()
-    _add_legend(figure)
-    return figure
-
-
-def fit_errors(
-    fits: Sequence[tuple[Float64, NDArray[np.bool_], Float64, Float64]],
-    names: Sequence[str],
-    units: Sequence[str],
-    title: str,
-) -> Figure:
-    """Draw the position errors of an identification along stretches of one log.
-
-    The part that was kept to judge is shaded.
-
-    Parameters
-    ----------
-    fits
-        For each stretch its times (rows,) [s], which of its rows were fitted (rows,), and the
-        errors before and after the fit (rows, joints) [rad or m].
-    names, units
-        Of the joints.
-    """
-    figure, blocks = _grid(names, 1, title, fits[-1][0][-1])
-    # Rows that are not numbers divide one line of a joint at the stretches' ends: a line for each
-    # stretch takes seconds.
-    gap = np.full((1, len(names)), np.nan)
-    time = np.concatenate([[*time, np.nan] for time, *_ in fits])
-    # An error of 0 has no place on a logarithmic axis.
-    before, after = (
-        np.maximum(np.abs(np.concatenate([part for row in fits for part in (row[at], gap)])), 1e-9)
-        for at in (2, 3)
-    )
-    held_out = np.concatenate([time[~fitted] for time, fitted, *_ in fits])
-    for joint, (axes,) in enumerate(blocks):
-        axes.set_ylabel(units[joint], fontsize=SMALL)
-        for label, errors, colour in (("before", before, SECOND[0]), ("after", after, FIRST[0])):
-            axes.semilogy(time, errors[:, joint], color=colour, lw=0.8, label=label)
-        if len(held_out):
-            axes.axvspan(
-                held_out[0],
-                held_out[-1],
-                color=SETPOINT,
-                alpha=0.15,
-                lw=0,
-            )
     _add_legend(figure)
     return figure
 

@@ -41,15 +41,12 @@ def log(tmp_path):
 def test_motors_are_written_for_other_commands(batchpid, log, tmp_path):
     out = tmp_path / "motors.yaml"
     robot, recording, gains = log
-    options = ("--gains", gains, "--no-payload", "--out", out)
-    picture = tmp_path / "fit.png"
-    words = ("identify", robot, recording, *options, "--picture", picture)
+    words = ("identify", robot, recording, "--gains", gains, "--no-payload", "--out", out)
     status, said, error = batchpid(*words)
     assert status == 0, error
     assert "hinge" in said
     actuators = Robot.load(robot, actuators=out).actuators
     assert actuators.strength[0, 0] == pytest.approx(0.9, rel=0.1)
-    assert picture.exists()
 
 
 def test_a_fit_that_leaves_too_much_of_the_error_ends_in_no_file(

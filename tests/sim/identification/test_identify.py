@@ -249,7 +249,6 @@ def test_the_report_has_all_values_and_errors(found):
     document = found.document()
     assert document["estimates"]["elbow"]["strength"]["value"] == found.interval("strength", 1)[0]
     assert found.interval("strength", 1) == found.interval("strength", "elbow")
-    assert len(found.figure().axes) == 2
     for place in (("strength", 5), ("delay", 0), ("mass", "fore"), ("speed", 0)):
         with pytest.raises(bp.InvalidArgumentError):
             found.interval(*place)
@@ -265,9 +264,8 @@ def test_held_out_logs_are_not_fitted(robot, log):
 
 
 WRONG = {
-    "contradict .* another kp": (["log"], {"params": gains().replace(kp=100.0)}),
-    "contradicts .*'none'": (["log"], {"compensate": "gravity"}),
-    "contradicts .*0.001": (["log"], {"timestep": 0.002}),
+    "compensate": (["log"], {"compensate": "all"}),
+    "timestep": (["log"], {"timestep": 0.0}),
     "extras": (["log"], {"extras": ["speed"]}),
     "evaluations": (["log"], {"evaluations": 0}),
     "hold 3 joints": (["log"], {"params": bp.make_params(3, 1.0)}),

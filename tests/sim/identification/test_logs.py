@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from arms import gains, load, motion, run
+from pages import ROOT, blocks
 
 import batchpid as bp
 from batchpid.sim import Randomization, RecordingError, Rollout, Runner, Uniform, write_recording
@@ -70,7 +71,7 @@ FAULTS = {
     r"knee": {"time": TIME, "qpos:knee": TIME},
     r"line 12, column 'qpos:elbow' is empty or not finite": changed("qpos:elbow", 10, ""),
     r"line 12, column 'qpos:elbow' is not a number": changed("qpos:elbow", 10, "1 rad"),
-    r"line 12: time decreases": changed("time", 10, 0.0),
+    r"line 12: time does not increase": changed("time", 10, TIME[9]),
     r"far beyond the joint's limits.*in rad or m": {
         name: 60 * v if name[0] == "q" else v for name, v in table().items()
     },
@@ -86,14 +87,11 @@ def test_faults_name_the_column_and_the_line(robot, tmp_path, problem):
         read(robot, tmp_path, FAULTS[problem])
 
 
-def test_repeated_rows_are_left_out_and_a_log_is_divided_at_gaps(robot, tmp_path):
+def test_a_log_is_divided_at_gaps(robot, tmp_path):
     def picked(*parts):
         rows = np.sort(np.concatenate(parts))
         return read(robot, tmp_path, {name: values[rows] for name, values in table().items()})
 
-    (log,) = picked(np.arange(200), [50, 120])
-    assert "2 rows repeat a time, the first at line 53" in str(log.remarks)
-    assert len(log.time) == len(log.command) == 200
     first, second = picked(np.arange(80), np.arange(120, 200))
     assert (len(first.time), len(second.time)) == (80, 80)
     assert second.time[0] == second.command_time[0] == TIME[120]
@@ -154,6 +152,29 @@ def test_a_recording_is_refused_or_divided_at_a_change(robot, tmp_path, change):
         return
     with pytest.raises(bp.InvalidArgumentError, match=f"has .*{change} that w"):
         read_logs(robot, [path])
+
+
+def test_the_program_of_the_page_makes_a_log_of_a_bag(robot, tmp_path, monkeypatch):
+    rosbag2 = pytest.importorskip("rosbags.rosbag2")
+    from rosbags.typesys import Stores, get_typestore
+
+    types = get_typestore(Stores.LATEST)
+    names = ("std_msgs/msg/Header", "builtin_interfaces/msg/Time", "sensor_msgs/msg/JointState")
+    header, stamp, state = (types.types[name] for name in names)
+    monkeypatch.chdir(tmp_path)
+    storage = rosbag2.StoragePlugin.MCAP
+    with rosbag2.Writer("bag", version=9, storage_plugin=storage) as writer:
+        line = writer.add_connection("/joint_states", names[-1], typestore=types)
+        for time in TIME:
+            seconds, part = 1_700_000_000 + int(time), round(1e9 * (time % 1))
+            values = np.array([np.sin(time), np.cos(time)])
+            message = state(header(stamp(seconds, part), ""), [*JOINTS], values, 0 * values, values)
+            writer.write(line, 0, types.serialize_cdr(message, names[-1]))
+    exec(blocks(ROOT / "docs/sim-to-real.md", "text")[0]["code"], {})
+    (log,) = read_logs(robot, ["log.csv"])
+    np.testing.assert_allclose(log.time - log.time[0], TIME, atol=1e-6)
+    np.testing.assert_allclose(log.qpos, np.stack([np.sin(TIME), np.cos(TIME)], axis=1))
+    assert log.measured
 
 
 def test_files_that_are_no_logs_say_what_a_log_is(robot, tmp_path):
