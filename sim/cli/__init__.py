@@ -2,7 +2,7 @@
 is the help.
 
 The result writes itself. ``report()`` is printed, and the output files come from ``save(path)`` and
-``figure()``; ``status`` is the exit status (without it: 0). To add a command, write such a function
+``figure()``. To add a command, write such a function
 and list it in :data:`SUMMARIES`, and in ``COMMANDS`` of the module of commands, which the overview
 does not import.
 """
@@ -48,9 +48,8 @@ OVERVIEW = "\n".join(
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status.
 
-    0: success. 2: bad input, or a file that cannot be written. 3: no env of ``rollout`` or ``demo``
-    settled. 130: Ctrl-C. 141: the reader of stdout closed it, as in ``| head``. 2 and 130 come with
-    one line on stderr.
+    0: success. 2: bad input, or a file that cannot be written. 130: Ctrl-C. 141: the reader of
+    stdout closed it, as in ``| head``. 2 and 130 come with one line on stderr.
     """
     arguments = sys.argv[1:] if argv is None else argv
     try:
@@ -110,7 +109,8 @@ def _run(arguments: list[str]) -> int:
             return int(end.code or 0)
         from batchpid.sim.cli.commands import run
 
-        return run(name, flags)
+        run(name, flags)
+    return 0
 
 
 def _fail(status: int, message: str) -> int:

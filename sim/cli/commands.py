@@ -103,8 +103,8 @@ COMMANDS = {
 }
 
 
-def run(name: str, record: object) -> int:
-    """Run a command with the record of its flags, and return its exit status."""
+def run(name: str, record: object) -> None:
+    """Run a command with the record of its flags."""
     flags.check(record)
     command = COMMANDS[name]
     values = vars(record)
@@ -114,14 +114,13 @@ def run(name: str, record: object) -> int:
     result = command.function(**arguments)
     # The view has run already, and leaves nothing to report.
     if result is None:
-        return 0
+        return
     # The report stands before the files, so that a full disk does not hide it.
     print(result.report())
     for name, path in paths.items():
         path.parent.mkdir(parents=True, exist_ok=True)
         _write(name, result, path)
         print(f"{name.replace('out', 'written')}: {path}")
-    return getattr(result, "status", 0)
 
 
 def _output_paths(command: CommandFunction, values: Document) -> dict[str, Path]:

@@ -22,7 +22,6 @@ from batchpid.sim.diagnosis.causes import (
     cause_lines,
     median_and_worst,
     overshoot_of_settled,
-    settled_envs,
     table,
 )
 from batchpid.sim.options.groups import DEFAULT_ENGINE
@@ -36,10 +35,6 @@ from batchpid.sim.tuning.gain_sets import gain_set
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-NOT_SETTLED = 3
-"""Exit status of `batchpid rollout` and `batchpid demo` where no env settles."""
-SHORTEST = 1.0
-"""Shortest run in which envs should settle [s]."""
 COLUMNS = {
     "following_error": ("following error", "{:.2g}"),
     "steady_state_error": ("final error", "{:.2g}"),
@@ -127,7 +122,7 @@ def rollout(
 
     To a setpoint robots start from seeded poses. The recording holds time (ticks,), setpoint, qpos,
     qvel, effort and saturated (ticks, envs, joints), ok (ticks, envs), and the robot's joint names,
-    units and limits. The exit status is 3 if no robot settles at its setpoint; the report says why.
+    units and limits.
     """
     from batchpid.sim.runner.runner import Runner
 
@@ -228,22 +223,6 @@ class RunReport:
     def seconds(self) -> float:
         """Simulated time [s]."""
         return self.rollout.tick * len(self.rollout.time)
-
-    @property
-    def status(self) -> int:
-        """Exit status: :data:`NOT_SETTLED` if a setpoint was held and no env settled, else 0.
-
-        In a run shorter than :data:`SHORTEST` an env only must not fail.
-        """
-        if not self.is_held:
-            return 0
-        if self.seconds < SHORTEST:
-            good = self.rollout.ok.all(0)
-        else:
-            good = settled_envs(self.rollout, self.robot)
-        if good.any():
-            return 0
-        return NOT_SETTLED
 
     def _figures(self) -> dict[str, Rows]:
         """Return the figures of the joints (envs, joints): following errors of setpoints that

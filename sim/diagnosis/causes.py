@@ -45,14 +45,6 @@ def joint_difference(robot: Robot, difference: Rows) -> Rows:
     return wrap(difference, robot.continuous / TURN, np)
 
 
-def settled_envs(rollout: Rollout, robot: Robot) -> Bool:
-    """Return the envs of a ``rollout`` of ``robot`` that have not failed and whose joints all
-    settle (envs,).
-    """
-    settled: Bool = ~np.logical_or.reduce(_Run(rollout, robot).unsettled, axis=1)
-    return settled
-
-
 def unsettled_findings(rollout: Rollout, robot: Robot) -> Findings:
     """Return the causes for which joints of a ``rollout`` of ``robot`` do not settle, in the order
     of :data:`RULES`.
@@ -67,7 +59,7 @@ def unsettled_findings(rollout: Rollout, robot: Robot) -> Findings:
     findings = Findings()
     if not len(rollout.time):
         return findings
-    envs = np.flatnonzero(~settled_envs(rollout, robot))[:EXAMINED]
+    envs = np.flatnonzero(_Run(rollout, robot).unsettled.any(1))[:EXAMINED]
     if not len(envs):
         return findings
     run = _Run(rollout.for_envs(envs), robot)

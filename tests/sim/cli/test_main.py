@@ -27,16 +27,16 @@ from batchpid.sim.cli.flags import flag
 class Result(NamedTuple):
     """Result of the stub."""
 
-    status: int
+    number: int
 
     def report(self):
         """Return a text."""
-        return "done"
+        return f"done {self.number}"
 
 
 @pytest.fixture
 def stub(monkeypatch):
-    """Return a list of actions of a command for tests, whose flag is its exit status."""
+    """Return a list of actions of a command for tests, whose report has its flag."""
     actions = []
 
     def stub(number=0):
@@ -45,7 +45,7 @@ def stub(monkeypatch):
             action()
         return Result(number)
 
-    stub.__annotations__["number"] = Annotated[int, Field(high=255), flag("Exit status.")]
+    stub.__annotations__["number"] = Annotated[int, Field(high=255), flag("A number.")]
     monkeypatch.setitem(COMMANDS, "stub", CommandFunction(stub, {}))
     monkeypatch.setitem(cli.SUMMARIES, "stub", "Test.")
     return actions
@@ -105,8 +105,8 @@ def test_a_base_is_free_or_fixed_by_a_flag(batchpid):
         assert ground in batchpid("inspect", "quadruped", "--base", base)[1]
 
 
-def test_flags_reach_the_command_and_its_status_is_returned(batchpid, stub):
-    assert batchpid("stub", "--number", "7")[0] == 7
+def test_flags_reach_the_command_and_its_report_is_printed(batchpid, stub):
+    assert batchpid("stub", "--number", "7")[:2] == (0, "done 7\n")
     assert batchpid("stub", "--number", "x")[0] == 2
 
 
@@ -155,7 +155,7 @@ def test_warnings_are_one_line(batchpid, stub):
 
     stub.append(action)
     before = warnings.showwarning
-    assert batchpid("stub") == (0, "done\n", "batchpid: warning: joint 4 cannot reach 1\n")
+    assert batchpid("stub") == (0, "done 0\n", "batchpid: warning: joint 4 cannot reach 1\n")
     assert warnings.showwarning is before
 
 

@@ -21,7 +21,7 @@ def saved(batchpid, tmp_path):
 
     def run(*words, short=SHORT):
         status, said, err = batchpid("rollout", *words, *short, "--force", "--out", tmp_path / FILE)
-        assert status in (0, 3), err  # 3: so short a run does not settle
+        assert status == 0, err
         return read_recording(tmp_path / FILE), said
 
     return run
@@ -71,11 +71,10 @@ def test_every_flag_changes_the_motion(flags, saved):
     assert np.abs(plain.qpos[-1] - other.qpos[-1]).max() > 1e-6
 
 
-@pytest.mark.parametrize(("seconds", "status"), [(0.9, 0), (1.0, 3)])
-def test_the_status_is_3_if_no_env_settles_in_a_second(batchpid, seconds, status):
-    flags = ("--num-envs", 2, "--workers", 0, "--engine", "mujoco", "--seconds", seconds)
-    found, said, err = batchpid("rollout", "panda", *flags, "--setpoint", *([0, 0, 0, 1] + [0] * 5))
-    assert (found, err) == (status, "")
+def test_the_cause_for_which_no_env_settles_is_named(batchpid):
+    words = ("panda", *SHORT, "--engine", "mujoco", "--setpoint", *([0, 0, 0, 1] + [0] * 5))
+    status, said, err = batchpid("rollout", *words)
+    assert (status, err) == (0, "")
     assert said.count("WHY: joint 'panda_joint4': the setpoint or the start pose is outside") == 1
 
 
