@@ -410,7 +410,7 @@ class Rollout:
     def check_ticks(self) -> None:
         """Raise InvalidArgumentError if the run holds no tick, so that nothing can be shown."""
         if not len(self.time):
-            remedy = "its run was cut short: run it again"
+            remedy = "run it for a tick or more"
             raise InvalidArgumentError("rollout", "holds no tick", remedy=remedy)
 
     def plot(self, **options: Any) -> Figure:

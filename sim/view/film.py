@@ -29,6 +29,7 @@ from batchpid.sim.view.view_data import Playback, rows_at
 from batchpid.task_space.frames import matrix_of, rotate
 
 LIGHT = LightSource(azdeg=68, altdeg=57)
+"""Light from the side of the camera."""
 _TILES = np.array([[0.74, 0.78, 0.83], [0.79, 0.82, 0.87]])
 """Colours of the tiles of the floor, like a chess board's."""
 _TILE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
