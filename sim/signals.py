@@ -3,7 +3,7 @@
 A sensor is one line of :class:`Observation`: dtype, text, unit, columns, and the option that it
 belongs to. Shared memory, snapshots, recordings and rollouts take names and shapes from that line.
 Its value comes from ``NativeExecutor._copies`` in native ticks and ``EnvGroup.observe`` in others,
-or from the engine's sensors of links.
+or from the engine's sensors of links; :class:`batchpid.sim.Runner` adds the pose of the tool.
 """
 
 from __future__ import annotations

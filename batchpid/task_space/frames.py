@@ -66,21 +66,6 @@ def unrotate(turn: Array, vector: Array) -> Array:
     return (turn * vector[..., None]).sum(-2)
 
 
-def multiply(a: Array, b: Array) -> Array:
-    """Return the products of matrices (..., n, 3) and (..., 3, m)."""
-    return (a[..., None] * b[..., None, :, :]).sum(-2)
-
-
-def turned(frame: Array, inner: Array) -> Array:
-    """Return the frames ``inner`` (..., 3, 4), which are given in ``frame`` (..., 3, 4), in the
-    axes in which ``frame`` is given.
-    """
-    xp = namespace(frame, inner)
-    product = multiply(frame[..., :3], inner)
-    shift = xp.zeros_like(frame[..., :3])
-    return product + xp.concatenate([shift, frame[..., 3:]], axis=-1)
-
-
 def matrix_of(wxyz: Array) -> Array:
     """Return the rotation matrices (..., 3, 3) of quaternions (..., 4) of any length but 0.
 

@@ -34,7 +34,6 @@ from batchpid.task_space.frames import (
     rotate,
     spatial_matrix,
     total,
-    turned,
 )
 
 GRAVITY = (0.0, 0.0, -9.81)
@@ -288,7 +287,8 @@ class RigidTree:
         for link, above in enumerate(self.parent):
             frames[link] = np.column_stack([matrix_of(self.wxyz[link]), self.position[link]])
             if link:
-                frames[link] = turned(frames[above], frames[link])
+                frames[link] = frames[above][:, :3] @ frames[link]
+                frames[link, :, 3] += frames[above][:, 3]
             if self.joint_types[link] == "fixed":
                 body.append(body[above] if link else -1)
                 if body[-1] >= 0:

@@ -90,6 +90,22 @@ def test_in_jax_it_is_the_loop_of_numpy(x64):
         np.testing.assert_allclose(ours.astype(float), theirs.astype(float), atol=1e-9)
 
 
+def test_its_program_is_written_into_a_file(x64):
+    from jax import export
+
+    loop = closed_loop(ARM, 2, actuators=bp.make_actuators(2, **MOTORS), guard=ARM.guard())
+    start, tree = x64.tree.flatten(loop.init(x64.numpy.asarray(ARM.start)))
+
+    @x64.jit
+    def tick(leaves, goal):
+        return x64.tree.leaves(loop.step(x64.tree.unflatten(tree, leaves), goal, substeps=2))
+
+    goal = x64.numpy.full(2, 0.7)
+    read = export.deserialize(export.export(tick)(start, goal).serialize())
+    for ours, theirs in zip(read.call(start, goal), tick(start, goal), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
 def test_gradients_to_gains_motors_and_masses_are_differences(x64):
     actuators = bp.make_actuators(2, command_delay=2e-3, strength=0.9)
     loop = closed_loop(ARM, 2, params=ARM.params(kp=60.0, ki=5.0, kd=6.0), actuators=actuators)
