@@ -84,7 +84,7 @@ class Matrix(Stage):
         return self.coupling.mass_matrix(matrix)
 
     def bind(self, program: Any, state: Array, values: Values) -> Values:
-        tree, bodies = program.pack.spec.rigid_tree.tables
+        tree, bodies = program.pack.rigid_tree.tables
         program.place(
             pose=values.seen.qpos,
             rate=values.seen.qvel,

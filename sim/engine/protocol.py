@@ -36,6 +36,7 @@ from batchpid.sim.engine.scene_spec import (
     own_friction,
 )
 from batchpid.sim.findings import Finding
+from batchpid.task_space.rigid_tree import RigidTree
 
 Capability = Literal["build", "wrenches", "base_state", "complete_state", "sapien_dissipation"]
 """
@@ -115,7 +116,12 @@ class EnginePack(SingleOwner, ABC):
         bits.
         """
         kind = NativeModel if self.steps_natively else TreeModel
-        return kind(lambda: self.spec.rigid_tree, "fixed" if self.spec.fixed_base else base)
+        return kind(lambda: self.rigid_tree, "fixed" if self.spec.fixed_base else base)
+
+    @property
+    def rigid_tree(self) -> RigidTree:
+        """Tree of the robot as the engine has it, all joints independent."""
+        return self.spec.rigid_tree
 
     @cached_property
     def joint_model(self) -> Any:

@@ -116,7 +116,8 @@ class Lanes:
         self.force_model = NativeModel(lambda: tree)
         self.joint_model = self.force_model
         self.steps_natively = True
-        self.spec = SimpleNamespace(fixed_base=True, rigid_tree=tree)
+        self.spec = SimpleNamespace(fixed_base=True)
+        self.rigid_tree = tree
         self.first_env = 0
         self.armature = np.zeros((1, self.dof))
         actuators = loop.control.actuators

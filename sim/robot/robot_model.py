@@ -26,7 +26,7 @@ from batchpid.motors.coupling import Coupling
 from batchpid.sim.description.merging import body_tree, merge_links, rigid_bodies
 from batchpid.sim.description.tables import DisabledPair, Tables
 from batchpid.sim.geometry.distances import Contacts
-from batchpid.task_space.frames import matrix_of
+from batchpid.task_space.frames import SpatialInertia, matrix_of, spatial_matrix
 from batchpid.task_space.rigid_tree import RigidTree
 
 if TYPE_CHECKING:
@@ -104,21 +104,38 @@ class RobotModel:
         """Return the inertia (dof,) that each joint moves at one pose (dof,) if the base floats and
         its feet stand.
 
-        The n feet carry the mass m of the robot in equal parts. With their Jacobians J_f and the
-        mass matrix M of the base at rest, the joints move M + sum_f m / n J_f^T J_f. The result is
-        the sum of the absolute values in each of its rows: diagonal gains for these sums are at
-        least as stiff as gains for the matrix (Gershgorin's theorem).
+        The feet F are pinned. Velocities q' of the joints move the base at V = A q', A = -J_b^+
+        J_j, where J_b and J_j are the Jacobians of F with respect to the base and the joints. The
+        mass matrix of this motion is the sum of J^T I J of all bodies, with J = J_j + A for twists
+        and inertias at the origin of the world. The result is the sum of the absolute values in
+        each of its rows: diagonal gains for these sums are at least as stiff as gains for the
+        matrix (Gershgorin's theorem).
         """
         tree = self.tree
         joints = np.asarray(qpos, np.float64)
         poses = ts.link_poses(tree, joints, tree.links)
-        matrix = np.array(ts.mass_matrix(tree, joints))
-        feet = self.contacts.feet(joints)
-        for link, foot in feet:
-            pose = poses[tree.index(link)]
-            point = matrix_of(pose[3:]).T @ (foot - pose[:3])
-            moving = np.asarray(ts.jacobian(tree, joints, link, point=point))[:3]
-            matrix += tree.mass.sum() / len(feet) * moving.T @ moving
+
+        def jacobian(at: int) -> Float64:
+            """Return the Jacobian (6, dof) of the point of a link at the origin of the world."""
+            origin = -matrix_of(poses[at, 3:]).T @ poses[at, :3]
+            return np.asarray(ts.jacobian(tree, joints, tree.links[at], point=origin))
+
+        of_base, of_joints = [], []
+        for link, (x, y, z) in self.contacts.feet(joints):
+            # A twist of the base moves each point p of the world by v + w x p.
+            point = np.hstack([np.eye(3), [[0, z, -y], [-z, 0, x], [y, -x, 0]]])
+            of_base.append(point)
+            of_joints.append(point @ jacobian(tree.index(link)))
+        follow = np.zeros((6, tree.dof))
+        if of_base:
+            # Directions that the feet leave free are cut off, not followed.
+            pinned = np.linalg.pinv(np.concatenate(of_base), rcond=1e-3)
+            follow = -pinned @ np.concatenate(of_joints)
+        matrix = np.zeros((tree.dof, tree.dof))
+        for at, pose in enumerate(poses):
+            body = SpatialInertia(tree.mass[at], tree.center[at], tree.inertia[at])
+            moving = jacobian(at) + follow
+            matrix += moving.T @ spatial_matrix(body.moved(pose[:3], pose[3:])) @ moving
         inertia: Float64 = np.abs(matrix).sum(1)
         return inertia
 

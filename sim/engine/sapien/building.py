@@ -1,9 +1,12 @@
-"""Scenes of one robot: the engine's settings, the robot from its tables, its collision groups."""
+"""Scenes of one robot: the engine's settings, the robot from its tables, its collision groups, its
+tree in PhysX.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import lru_cache
 from threading import RLock
 from typing import Any
@@ -14,12 +17,14 @@ from sapien.wrapper.articulation_builder import ArticulationBuilder
 
 from batchpid.arrays.array_types import Float64
 from batchpid.errors import RobotError
-from batchpid.sim.description.tables import CONTACT_FRICTION
+from batchpid.sim.description.merging import body_tree
+from batchpid.sim.description.tables import CONTACT_FRICTION, Body, Tables
 from batchpid.sim.engine.sapien.limits import filter_words
 from batchpid.sim.engine.sapien.user_content import HeadlessScene
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.geometry.shapes import Shape, hull
-from batchpid.task_space.frames import SpatialInertia, matrix_of
+from batchpid.task_space.frames import SpatialInertia, from_rpy, matrix_of
+from batchpid.task_space.rigid_tree import RigidTree
 
 SAPIEN_DISSIPATION = 0.05
 """SAPIEN 3's default of the friction of joints, and of the damping of links [1/s]."""
@@ -199,9 +204,9 @@ def build_scene(
         builder = articulation_builder(spec)
         robot = builder.set_scene(scene).build()
         builder.set_scene(None)  # the scene can be freed
+        _add_shapes(spec, robot)
         if spec.ground and spec.collisions:
             scene.add_ground(0.0, render=False)
-        _add_shapes(spec, robot)
     robot.set_sleep_threshold(0.0)
     dissipation = SAPIEN_DISSIPATION if spec.dissipation == "sapien" else 0.0
     for link in robot.links:
@@ -229,3 +234,44 @@ def _add_shapes(spec: SceneSpec, robot: physx.PhysxArticulation) -> None:
         built = _collision_shape(shape)
         built.set_collision_groups(words[shape.owner])
         links[shape.body].attach(built)
+
+
+@lru_cache(maxsize=8)
+def rounded_tree(spec: SceneSpec) -> RigidTree:
+    """Return the tree of the robot of ``spec`` as PhysX rounds it, all joints independent, the same
+    object for equal specs.
+
+    Before each link but the base comes a link without mass, "LINK (joint)", in the frame of the
+    joint above.
+    """
+    _scene, robot = build_scene(spec, new_system(spec))
+    links = {link.name: link for link in robot.links}
+    rows = []
+    for body in spec.simulated.bodies:
+        link = links[body.name]
+        place = link.cmass_local_pose
+        axes = matrix_of(_wxyz(place))
+        moments = np.diag([float(str(moment)) for moment in link.inertia])
+        row = Body(body.name, None, mass=link.mass, center=np.asarray(place.p, float))
+        row = row._replace(inertia=axes @ moments @ axes.T)
+        if body.joint is not None:
+            # SAPIEN's joint has a frame in the parent and one in the child: the link between has the first.
+            above = f"{body.name} (joint)"
+            moving = replace(body.joint, axis=(1.0, 0.0, 0.0))
+            rows.append(_placed(Body(above, moving), link.joint.pose_in_parent))
+            fixed = replace(body.joint, type="fixed", parent_link=above)
+            row = _placed(row._replace(joint=fixed), link.joint.pose_in_child.inv())
+        rows.append(row)
+    return body_tree(Tables(tuple(rows), (), {}), spec.fixed_base, spec.gravity)
+
+
+def _placed(row: Body, pose: Pose) -> Body:
+    """Return a body at one of SAPIEN's poses in its parent."""
+    return row._replace(position=np.asarray(pose.p, float), wxyz=_wxyz(pose))
+
+
+def _wxyz(pose: Pose) -> Float64:
+    """Return the rotation of one of SAPIEN's poses, by roll, pitch and yaw, as SAPIEN's own
+    dynamics take it.
+    """
+    return from_rpy(np.asarray(pose.rpy, float))

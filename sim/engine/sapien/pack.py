@@ -29,6 +29,7 @@ from batchpid.sim.engine.sapien.building import (
     build_scene,
     engine_settings,
     new_system,
+    rounded_tree,
     set_inertia,
 )
 from batchpid.sim.engine.sapien.calls import SapienStep, obstacle
@@ -36,6 +37,7 @@ from batchpid.sim.engine.sapien.limits import refusals, shortfalls
 from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_body, write_root
 from batchpid.sim.engine.scene_spec import PHYSICS, SceneSpec, Variation
 from batchpid.task_space.frames import matrix_of, unrotate
+from batchpid.task_space.rigid_tree import RigidTree
 
 
 class Pack(EnginePack):
@@ -135,6 +137,10 @@ class Pack(EnginePack):
             coriolis=coriolis,
             constraint=self._constraint_address,
         )
+
+    @property
+    def rigid_tree(self) -> RigidTree:
+        return rounded_tree(self.spec)
 
     def _bias(self) -> Float64:
         return self._own_force(True, True)
