@@ -82,7 +82,7 @@ class Cluster:
         self.ray: Any = _connected()
         """The module."""
         resources = [node["Resources"] for node in self.ray.nodes() if node["Alive"]]
-        cpus = sorted([int(each.get("CPU", 0)) for each in resources], reverse=True)[:num_envs]
+        cpus = sorted([int(machine.get("CPU", 0)) for machine in resources], reverse=True)[:num_envs]
 
         def workers(machines: int) -> int:
             return machines * cpus[machines - 1]

@@ -252,9 +252,9 @@ class WorkerPool(SingleOwner):
             try:
                 worker.close()
                 worker.open()
-                for each in (*self.replay.requests, request):
-                    each.write(self.arrays, worker.envs)
-                    worker.send(each)
+                for replayed in (*self.replay.requests, request):
+                    replayed.write(self.arrays, worker.envs)
+                    worker.send(replayed)
                     result = worker.receive()
                     if isinstance(result, Failure):  # of a ``build`` that works no more
                         return result
