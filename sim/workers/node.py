@@ -82,7 +82,8 @@ class Cluster:
         self.ray: Any = _connected()
         """The module."""
         resources = [node["Resources"] for node in self.ray.nodes() if node["Alive"]]
-        cpus = sorted([int(machine.get("CPU", 0)) for machine in resources], reverse=True)[:num_envs]
+        counts = [int(machine.get("CPU", 0)) for machine in resources]
+        cpus = sorted(counts, reverse=True)[:num_envs]
 
         def workers(machines: int) -> int:
             return machines * cpus[machines - 1]
