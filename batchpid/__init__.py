@@ -33,9 +33,10 @@ from batchpid.gains.design import design_gains
 from batchpid.gains.stability import stability_bound
 from batchpid.io.documents import dumps_params, load_params, loads_params, save_params
 from batchpid.io.files import attributes_of
+from batchpid.law.bumpless import track
 from batchpid.law.coefficients import Coefficients, discretise
 from batchpid.law.params import PIDParams, make_params
-from batchpid.law.pid import advance, init, reset, step, track
+from batchpid.law.pid import advance, init, reset, step
 from batchpid.law.state import PIDState, Terms
 from batchpid.motors import Actuators, load_actuators, make_actuators, save_actuators
 from batchpid.motors.guard import Guard, make_guard

@@ -58,6 +58,8 @@ class BatchPID(SingleOwner):
         Backend "jax" without JAX.
     """
 
+    instead = "keep params and a state of batchpid.step"
+
     def __init__(
         self,
         params: PIDParams,

@@ -256,7 +256,7 @@ def main(options: Options) -> None:
     print(table(rows, ["case", "thousand env-steps/s", f"{OURS} / case", "per process"], "lrrr"))
     print("\nmicroseconds per env step in a worker:")
     print(
-        table([[OURS, *map(str, figures["phases"].values())]], ["", *figures["phases"]], "lrrrrrr")
+        table([[OURS, *map(str, figures["phases"].values())]], ["", *figures["phases"]], "lrrrrr")
     )
     if options.json is not None:
         options.json.parent.mkdir(parents=True, exist_ok=True)

@@ -8,6 +8,7 @@ Runner does not use this module.
 
 from __future__ import annotations
 
+import re
 import tempfile
 from typing import Any
 
@@ -59,7 +60,7 @@ class TutorialLoop:
         loader.fix_root_link = True
         with tempfile.NamedTemporaryFile("w", suffix=".urdf") as file:
             # Without visuals, which need a render device.
-            file.write(to_urdf(robot).text)
+            file.write(re.sub(r"<visual>.*?</visual>", "", to_urdf(robot).text, flags=re.DOTALL))
             file.flush()
             self.robot: Any = loader.load(file.name)
         self._gains = (

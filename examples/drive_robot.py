@@ -8,7 +8,7 @@ all.
 
 SAPIEN's tutorial "Drive Robot with PID Controller" has the same two switches. Without compensation
 a drive keeps a steady-state error, because its effort against gravity is proportional to the error;
-the integral of a PID removes it. The tutorial's own gains (--gains sapien-tutorial) oscillate, because the
+the integral of a PID removes it. The tutorial's own gains (--gains tutorial) oscillate, because the
 robot is as frictionless as its URDF says.
 """
 

@@ -49,9 +49,9 @@ OF_FILES = (
          "floating, planar and unknown joints; an axis without direction",
          "fixed joints, a floating one at the root a floating base; the x axis, the URDF's default"),
     FindingKind("limits", "warning",
-         "limits that are swapped, missing, unreadable, all 0 or equal; `effort` or `velocity` of 0 or -1; in an MJCF"
+         "limits that are swapped, missing, unreadable, or all 0; `effort` or `velocity` of 0 or -1; in an MJCF"
          " file effort limits that differ by direction, and limits of a servo's setpoints",
-         "swapped back; no limit (equal ones stay); the smaller limit; `guard=True` keeps to those of setpoints"),
+         "swapped back; no limit; the smaller limit; `guard=True` keeps to those of setpoints"),
     FindingKind("dynamics", "warning", "friction or damping that is negative or no number", "0"),
     FindingKind("mimic", "warning",
          "a mimic of a fixed or unknown joint, of itself, in a circle, or by 0",

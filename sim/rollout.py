@@ -112,8 +112,7 @@ class RunInfo:
     wrenches: tuple[str, ...] | None = None
     """Links with a wrench sensor."""
     rates: bool | None = None
-    """True if setpoints were given with rates, and moved within the ticks; None if unknown, as
-    after a kill.
+    """True if setpoints were given with rates, and moved within the ticks; None if unknown.
     """
     params: PIDParams | None = None
     """PID parameters at the start."""
@@ -340,14 +339,16 @@ class Rollout:
         """Return successive rollouts of a runner as one, with the info of the first and the faults
         of the last, which include the earlier ones.
 
-        Raises InvalidArgumentError for parts with other joints, envs or ticks, or that do not
+        Raises InvalidArgumentError for parts of other robots, envs or ticks, or that do not
         follow each other.
         """
         first = parts[0]
         time = np.concatenate([part.time for part in parts])
-        kinds = {(part.info.joint_names, part.num_envs, part.tick) for part in parts}
+        kinds = {
+            (part.info.digest, part.info.joint_names, part.num_envs, part.tick) for part in parts
+        }
         if len(kinds) > 1 or (np.abs(np.diff(time) - first.tick) > 1e-6 * first.tick).any():
-            problem = "are of other joints, envs or ticks, or do not follow each other"
+            problem = "are of other robots, envs or ticks, or do not follow each other"
             remedy = "join the rollouts of one run, in their order"
             raise InvalidArgumentError("parts", problem, remedy=remedy)
         joined: dict[str, Any] = {}

@@ -167,7 +167,7 @@ class Observation(NamedTuple):
 
     ``effort``, ``saturated`` and ``guarded`` are from the last sim step; under control "drive" the
     effort is qf alone, since PhysX does not report drive efforts. ``ok`` is False for an env that
-    failed in this tick (by its state, its speed or its command), or is suspended since an earlier
+    failed in this tick (by its state, its command or its controller), or is suspended since an earlier
     one: see :attr:`batchpid.sim.Runner.faults`. ``tool_pose`` (envs, 7) is the pose of the tool at ``qpos``,
     where setpoints are poses: position [m] and unit quaternion (w, x, y, z); else None.
 
@@ -180,10 +180,10 @@ class Observation(NamedTuple):
 
     ``contact_force`` (envs, links, 3) is the net force of all contacts on each link of the option
     ``contacts`` [N], along the axes of the world, as the mean over the sim steps of the tick, and
-    ``touching`` (envs, links) whether it had a contact in one of them. ``wrench`` (envs, links, 6)
-    is the mean force and torque that its parent exerts on each link of the option ``wrenches`` [N,
-    N m], at the origin and along the axes of the link's frame. They are 0 after a reset, and None
-    without these options.
+    ``touching`` (envs, links) whether it had a contact in one of them; in SAPIEN both are of the
+    normal forces in the last sim step. ``wrench`` (envs, links, 6) is the mean force and torque
+    that its parent exerts on each link of the option ``wrenches`` [N, N m], at the origin and along
+    the axes of the link's frame. They are 0 after a reset, and None without these options.
     """
 
     qpos: Annotated[Float32, Quantity(np.float32, "joint position", "rad|m")]

@@ -283,7 +283,6 @@ class LeafBuilder:
 def frozen(record: R) -> R:
     """Return a record with read-only NumPy arrays, which later writes by the caller do not
     change.
-
     """
     copied: R = mapped(
         lambda leaf: frozen_array(leaf) if isinstance(leaf, np.ndarray) else leaf, record

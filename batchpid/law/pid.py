@@ -39,8 +39,6 @@ from batchpid.arrays.elementwise import (
     replace_envs,
     wrap,
 )
-from batchpid.checks import instance
-from batchpid.errors import InvalidArgumentError
 from batchpid.law.coefficients import Coefficients, discretise
 from batchpid.law.params import PIDParams
 from batchpid.law.state import (
@@ -123,34 +121,6 @@ def step(
     rest = measurement_rate, setpoint_rate, feedforward
     state, terms = _step(params, state, setpoint, measurement, dt, *rest)
     return state, terms.effort
-
-
-def track(
-    params: PIDParams,
-    state: PIDState,
-    setpoint: Array,
-    measurement: Array,
-    effort: Array,
-    dt: Array,
-    **inputs: Array,
-) -> PIDState:
-    """Return the state whose next step, on these same inputs, gives ``effort`` (envs, joints): its
-    integral makes up the difference.
-
-    Call it at every step under manual control, or once after a change of kp or kd, with the last
-    effort. ``inputs`` are the optional ones of :func:`step`. The limits hold, those of the integral
-    too.
-
-    Raises InvalidArgumentError as :func:`step`, and if the params have no integral (ki is None).
-    """
-    if instance("params", params, PIDParams, "build them with make_params").ki is None:
-        remedy = "give ki; 0 is allowed"
-        raise InvalidArgumentError("params.ki", "is off: no integral takes over", remedy=remedy)
-    _, effort = checked_inputs(params, state, measurement, effort=effort)
-    _, terms = _step(params, state, setpoint, measurement, dt, **inputs)
-    integral = state.integral + (effort - terms.unsaturated)
-    xp = namespace(*params, integral)
-    return state._replace(integral=clip(integral, params.integral_min, params.integral_max, xp))
 
 
 def _step(

@@ -133,7 +133,7 @@ def init(
     requested = zeros if effort is None else zeros + effort
     # What no effect needs is None, and costs nothing.
     command = positions = velocities = encoder = key = step = None
-    # Histories are as long as the longest delay may become, so that delays can grow in flight.
+    # Histories are as long as the longest delay.
     if actuators.max_delay is not None:
         if samples is None:
             samples = delay.samples_of(actuators.max_delay, dt)

@@ -159,6 +159,7 @@ def make_plan(
     InvalidArgumentError
         Naming the option, joint, env and value; also for an option of another blend.
     """
+    options = {name: value for name, value in options.items() if value is not None}
     build = LeafBuilder(joints, joint_names, dtype, options.values())
     leaves = build.options(PLAN_FIELDS, options)
     # A blend has its own option alone.

@@ -166,14 +166,17 @@ def _check_shapes(params: OSCParams, inputs: OSCInputs) -> None:
     """Raise InvalidArgumentError for an input that is not (envs, size), and for params of other
     envs.
     """
-    envs, dof = np.shape(inputs.qpos) if np.ndim(inputs.qpos) == 2 else (1, -1)
+    remedy, shape = "give one row for each env", np.shape(inputs.qpos)
+    if len(shape) != 2:
+        raise InvalidArgumentError("qpos", f"has shape {shape}, not (envs, dof)", remedy=remedy)
+    envs, dof = shape
     sizes = dict(zip(inputs._fields, (7, dof, dof, 6, 6, 6, dof), strict=True))
     for name, rows in {**params._asdict(), **inputs._asdict()}.items():
         if rows is not None:
             columns = sizes.get(name, np.shape(rows)[-1])
             if np.shape(rows) not in ((envs, columns), (1, columns)):
                 problem = f"has shape {np.shape(rows)}, not ({envs}, {columns})"
-                raise InvalidArgumentError(name, problem, remedy="give one row for each env")
+                raise InvalidArgumentError(name, problem, remedy=remedy)
 
 
 def _advance(

@@ -159,6 +159,7 @@ def make_osc_params(
     mode = choice("discretization", discretization, CHOICES["discretization"])
     ahead = dt if mode == "implicit" else 0.0  # of the gains: the time at which they act
     columns = {"axis": AXES, "joint": tree.joint_names, "norm": ("norm",), "s0": ("s0",)}
+    options = {name: value for name, value in options.items() if value is not None}
     rows: dict[str, Array] = {}
     envs = 1
     for name, field in OSC_FIELDS.items():

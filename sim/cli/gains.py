@@ -130,8 +130,9 @@ def export(
 
     Target "c" is a C99 header without dependencies: the law with its gains, bit-identical to
     batchpid's. "ros2_control" is the YAML of a controller. "mjcf" is the robot for MuJoCo, with
-    motors, or with servos where --gains is given; "urdf" the robot with its repairs. Differences
-    between the file and batchpid's law or the robot's file are printed, one line each.
+    motors, or with servos where --gains is given; "urdf" the robot with its repairs, without
+    elements that have no effect here. Differences between the file and batchpid's law or the
+    robot's file are printed, one line each.
     """
     # The robot alone, or the law.
     if to == "urdf":

@@ -1,7 +1,8 @@
 """Reader of MJCF files: MuJoCo compiles them, and the model becomes tables, motors and a start
 pose.
 
-Geoms that add neither shape nor mass are not compiled, so their meshes and textures may be missing.
+Geoms that are only drawn are not compiled: their textures may be missing, and their meshes in
+bodies with ``<inertial>``.
 """
 
 from __future__ import annotations

@@ -258,7 +258,7 @@ class EnginePack(SingleOwner, ABC):
     @abstractmethod
     def take_sensed(self, steps: int) -> dict[str, Rows]:
         """Return the means of the link sensors over the last ``steps`` sim steps, all since the
-        last call.
+        last call, or, of contacts in SAPIEN, their values in the last one.
 
         ``contact_force`` (M, links, 3), ``touching`` (M, links), 0 without a contact, and
         ``wrench`` (M, links, 6), as :class:`batchpid.sim.Observation` describes them; of robots

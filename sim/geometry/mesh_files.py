@@ -67,7 +67,7 @@ def _candidates(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Iterat
     if package is None:
         # A plain path may be relative to any folder above, as in a package.
         relative = re.sub(r"^file:(//(localhost)?)?", "", name)
-        yield from (folder / relative for folder in folders)
+        yield from (folder / relative for folder in (path.absolute().parent, *folders))
     else:
         for relative in package.groups():
             yield from (folder / relative for folder in folders)

@@ -301,7 +301,8 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         if self._rows is not None:
             rows = list(action.swapaxes(0, 1))
         for row in rows:
-            setpoints.append(np.asarray(self.command(row, setpoints[-1])))
+            last = setpoints[-1]
+            setpoints.append(self._returned("command", self.command(row, last), last.shape))
         # In next-step mode an ended env holds its setpoint: this step begins its next episode.
         setpoint = np.where(begins[:, None], last, setpoints[self._ticks])
         if self._rows is None:
@@ -375,7 +376,8 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         for env in np.flatnonzero(mask).tolist():
             if seeds is not None:
                 self._generators[env] = np.random.default_rng(seeds[env])
-            self._starts[env] = self.draw(env, self._generators[env])
+            start = self.draw(env, self._generators[env])
+            self._starts[env] = self._returned("draw", start, (self.robot.dof,))
             if self._latency[1] > 0:
                 low, high = self._latency
                 late = self._generators[env].uniform(low, high)

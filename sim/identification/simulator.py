@@ -89,8 +89,6 @@ class Stretch(NamedTuple):
     """Number of its log."""
     measured: Any = None
     """Positions (rows, joints)."""
-    time: Any = None
-    """Times (rows,) [s]."""
     fitted: Any = None
     """Fitted rows; the others are held out (rows,) bool."""
 
@@ -204,7 +202,7 @@ class LogPlant:
         inertia = np.zeros((envs, tree.dof)) + dt * control.friction.viscous
         if actuators.armature is not None:
             inertia = inertia + actuators.armature
-        limits = self.low, self.high, self._weight, 2 * dt, dt
+        limits = self.low, self.high, self._weight, dt
         plant = TreePlant(tree, self._bodies(candidates), inertia, coupling, *limits)
         return ClosedLoop(plant, control, tree, np.zeros(tree.dof))
 
@@ -379,6 +377,5 @@ def _window(
         before,
         number,
         log.qpos[rows],
-        log.time[rows],
         place <= split + 1e-6,
     )

@@ -315,7 +315,6 @@ def _tree_plant(options: RunnerOptions, tree: RigidTree, control: Control) -> Tr
     ends = np.array([[joint.lower, joint.upper] for joint in joints])
     low, high = np.where(is_limited, ends.T, [[-np.inf], [np.inf]])
     matrix = mass_matrix(tree, np.zeros((1, tree.dof)))[0] + np.diag(inertia[0])
-    time = 2 * control.timestep
     return TreePlant(
         tree,
         tree.bodies,
@@ -324,6 +323,5 @@ def _tree_plant(options: RunnerOptions, tree: RigidTree, control: Control) -> Tr
         low,
         high,
         np.diag(np.linalg.inv(matrix)).copy(),
-        time,
         control.timestep,
     )

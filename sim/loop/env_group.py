@@ -240,8 +240,6 @@ class EnvGroup:
                 inputs = self._faults.suspended, self._draws.episodes, substeps
                 if self._pushes.push(self.pack, *inputs):
                     executor.measure()
-            if self._sensed:
-                self.pack.take_sensed(1)  # those of the ticks before
             if self._faults.suspended.any() or not are_finite(*command):
                 command = self._faults.contained(command, before + 1, executor.measured.qpos)
                 self._place_failed()

@@ -144,8 +144,8 @@ class Lanes:
         }
         free = structure("FreeMotion")(
             model=self.joint_model.address,
-            stiffness=(most * plant.limit_time) ** -2.0,
-            rate_gain=2.0 / (most * plant.limit_time),
+            stiffness=(most * 2 * plant.timestep) ** -2.0,
+            rate_gain=2.0 / (most * 2 * plant.timestep),
             least=least,
             most=most,
             width=width,

@@ -47,8 +47,6 @@ class TreePlant:
     """Limits (dof,) [rad or m]."""
     weight: Float64
     """Diagonal of M^-1 at the pose 0 (dof,): MuJoCo's ``dof_invweight0``."""
-    limit_time: float
-    """Time constant of the limits [s]: MuJoCo's ``solref``."""
     timestep: float
 
     def init(self, qpos: Array, qvel: Array) -> tuple[Array, Array]:
@@ -102,7 +100,8 @@ class TreePlant:
         curve = xp.where(x > 0.5, 1.0 - 2.0 * (1.0 - x) ** 2, 2.0 * x * x)
         impedance = xp.where(x < 1.0, least + curve * (most - least), most)
         cost = impedance / ((1.0 - impedance) * self.weight)
-        stiffness, rate_gain = (most * self.limit_time) ** -2.0, 2.0 / (most * self.limit_time)
+        time = 2 * self.timestep  # constant of the limits: MuJoCo's solref
+        stiffness, rate_gain = (most * time) ** -2.0, 2.0 / (most * time)
         push = sign * (-rate_gain * sign * qvel - stiffness * impedance * distance)
         eye = xp.eye(matrix.shape[-1], dtype=matrix.dtype)
 

@@ -82,14 +82,16 @@ def step_responses(
             problem = f"have the joints {', '.join(other.info.joint_names)}, too"
             remedy = f"compare runs with the joints {', '.join(names)}"
             raise InvalidArgumentError("rollouts", problem, remedy=remedy)
-    prefixes = [f"{label}: " for label in labels] or [""]
+    prefixes = [""]
+    if len(runs) > 1:
+        prefixes = [f"{label}: " for label in labels or ("first", "second")]
     command = run.info.own_command
     entries = []
     if command is not None and not run.info.sets_positions:
         entries = [f"setpoint {label}" for label in command.labels]
     chosen = [names.index(choice("joints", joint, names)) for joint in joints or names]
     titles = [*(names[index] for index in chosen), *entries]
-    figure, blocks = _grid(titles, 2, title, max(run.time[-1] for run in runs))
+    figure, blocks = _grid(titles, title, max(run.time[-1] for run in runs))
     # Joints come first, entries of another command after them.
     for joint, (above, below) in zip(chosen, blocks, strict=False):
         _draw_positions(above, runs, prefixes, joint)
@@ -133,23 +135,22 @@ def save(figure: Figure, path: str | Path, dpi: int = 110) -> Path:
 
 def _grid(
     names: Sequence[str],
-    rows: int,
     title: str,
     end: float,
 ) -> tuple[Figure, list[list[Axes]]]:
-    """Return a figure, and for each of ``names`` a column of ``rows`` axes, positions above
+    """Return a figure, and for each of ``names`` a column of two axes, positions above
     efforts, up to the time ``end`` [s].
     """
     columns = min(len(names), 3)
     lines = math.ceil(len(names) / columns)
-    heights = (1.7, 0.85)[:rows]
+    heights = (1.7, 0.85)
     figure = Picture(figsize=(4.0 * columns, sum(heights) * lines + 0.8), layout="constrained")
     figure.suptitle(_plain(title), fontsize=11)
-    grid = figure.add_gridspec(lines * rows, columns, height_ratios=heights * lines)
+    grid = figure.add_gridspec(lines * 2, columns, height_ratios=heights * lines)
     blocks = []
     for place, name in enumerate(names):
         line, column = divmod(place, columns)
-        block = [figure.add_subplot(grid[line * rows + row, column]) for row in range(rows)]
+        block = [figure.add_subplot(grid[2 * line + row, column]) for row in range(2)]
         for axes in block:
             axes.tick_params(
                 labelsize=SMALL,

@@ -87,9 +87,14 @@ def read_csv(
     if lines:
         # Programs separate cells by other characters, and quote the names.
         delimiter = max(",;\t", key=re.sub('"[^"]*"', "", lines[0][1]).count)
-        names, *table = csv.reader(
-            [line for _, line in lines], delimiter=delimiter, skipinitialspace=True
-        )
+        try:
+            # Line by line: a quotation mark that is not closed ends with its line.
+            names, *table = [
+                next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+                for _, line in lines
+            ]
+        except csv.Error as bad:
+            raise error(source, str(bad), "correct the line") from None
         header = [re.sub(r"\s*:\s*", ":", name.strip(), count=1) for name in names]
         numbers = [number for number, _ in lines[1:]]
         for number, cells in zip(numbers, table, strict=False):

@@ -136,7 +136,7 @@ def setpoint_guard(
     Raises InvalidArgumentError if a follower of a continuous joint has position limits.
     """
     for joint in joints:
-        if joint.continuous and math.isfinite(joint.lower):
+        if joint.continuous and joint.mimic is None and math.isfinite(joint.lower):
             problem = "turns without end, and cannot hold the position limits of its follower"
             remedy = "make it revolute with limits, or remove those of the follower"
             raise InvalidArgumentError("guard", problem, joint=joint.name, remedy=remedy)

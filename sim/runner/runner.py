@@ -3,8 +3,7 @@
 Each method makes a request of its arguments (:mod:`batchpid.sim.runner.operations`), and
 :meth:`Runner._execute` runs it.
 
-Longer than 350 lines because the public signatures and their documentation are spelled out for
-editors and readers.
+Longer than 350 lines because the public methods and their documentation are in one class.
 """
 
 from __future__ import annotations

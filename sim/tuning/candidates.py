@@ -100,8 +100,8 @@ class GainCandidates:
     gains.
 
     Each env runs one move of one candidate: all moves as steps, then the half whose smooth motions
-    are the shortest. Candidates have
-    ``headroom``, a share of the effort limits. The worst move counts unless robots are ``drawn``.
+    are the shortest. Candidates have ``headroom``, a share of the effort limits. The worst move
+    counts unless robots are ``drawn``.
     """
 
     def __init__(

@@ -35,7 +35,7 @@ HOST = "127.0.0.1"
 CHART_FRAMES = 5
 """Frames between two updates of chart and status."""
 PAST_FRAMES = 240
-"""Longest past that the chart shows."""
+"""Most frames that the chart shows."""
 SERIES = (
     {"label": "s"},
     {"label": "qpos", "stroke": "#15803d", "width": 2},
@@ -105,7 +105,7 @@ class View(AbstractContextManager["View"]):
                 data.advance()
             if requested or self.running:
                 self._show_robots()
-            self._past.append(np.stack([data.observation.qpos[0], data.setpoint[0]]))
+                self._past.append(np.stack([data.observation.qpos[0], data.setpoint[0]]))
             count += 1
             if count % CHART_FRAMES == 0:
                 self._draw_chart()
@@ -186,6 +186,7 @@ class View(AbstractContextManager["View"]):
         """Carry out a button of the motion."""
         if button == "Reset":
             self.data.reset()
+            self._past.clear()
         else:
             self.running = button == "Run"
 

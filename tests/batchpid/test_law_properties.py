@@ -82,17 +82,29 @@ def test_a_nan_reaches_the_effort_of_its_joint_alone():
 @settings(max_examples=10)
 def test_track_makes_the_next_step_give_the_effort(case, run, share, rates):
     options = OPTIONS[case] | {"ki": OPTIONS[case].get("ki", 0.0)}
+    options.pop("deadband", None)
     params = bp.make_params(JOINTS, **options)._replace(integral_min=None, integral_max=None)
     state = roll(params, *run)[0][-1]
     effort = share * np.minimum(1e3 if params.effort_max is None else params.effort_max, 1e3)
-    if params.effort_rate_limit is not None:
-        state = state._replace(effort=effort)
     inputs = {"feedforward": run[2][0]}
     if rates:
         inputs |= {"measurement_rate": run[2][1], "setpoint_rate": run[2][2]}
     state = bp.track(params, state, run[0][0], run[1][0], effort, DT, **inputs)
     _, again = bp.step(params, state, run[0][0], run[1][0], DT, **inputs)
     np.testing.assert_allclose(again, effort, rtol=1e-6, atol=1e-6)
+
+
+def test_a_manual_joint_that_is_tracked_at_every_step_goes_on_without_a_jump():
+    params = bp.make_params(JOINTS, 40.0, 5.0, 2.0, derivative_filter_time=0.02)
+    y = np.zeros((ENVS, JOINTS))
+    state, manual = bp.init(params, y), np.full_like(y, 5.0)
+    for _ in range(100):
+        y = y + DT  # 1 rad/s, whose derivative the first steps see
+        state = bp.track(params, state, np.ones_like(y), y, manual, DT)
+    _, effort = bp.step(params, state, np.ones_like(y), y, DT)
+    np.testing.assert_allclose(effort, manual)
+    _, effort = bp.step(params, state, np.ones_like(y), y + DT, DT)
+    assert np.abs(effort - manual).max() < 3.0  # not kd times the speed since the start
 
 
 @given(runs, st.floats(0, 100))

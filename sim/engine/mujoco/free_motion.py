@@ -190,7 +190,8 @@ def places() -> tuple[int, ...] | None:
         _offset(address, _BEGINNING, _FLAGS, np.int32),
         *(_offset(address, _BEGINNING, value, np.uint64) for value in values),
     ]
-    return None if None in offsets else tuple(filter(None, offsets))
+    unique = tuple(offset for offset in offsets if offset is not None)
+    return unique if len(unique) == len(offsets) else None
 
 
 class GroupClearance:

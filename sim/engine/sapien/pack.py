@@ -180,6 +180,7 @@ class Pack(EnginePack):
                 joint.set_armature(armature)
             _disable_gravity(robot, bool(self._suspended[row]))
             self.robots[row] = robot
+        self._stepped[rows] = False
         self._bind()
 
     def read_qpos(self) -> Float64:
