@@ -81,8 +81,8 @@ SOLVERS = {
 
 
 Build = Callable[[Any, int], Any]
-"""``build(scene, env)`` adds actors to the engine's scene of env ``env``; returns those whose poses
-are read, or None.
+"""``build(scene, env)`` adds actors and articulations to the engine's scene of env ``env``; returns
+the entities whose poses are read, or None.
 """
 
 

@@ -171,7 +171,7 @@ class SceneOptions(OptionGroup):
     ``obs.wrench``; default none. It needs ``engine="mujoco"``.
     """
     build: Annotated[Callable[[Any, int], Any] | None, option("snapshot", "scene")] = None
-    """Function ``build(scene, env)`` that adds actors to the ``sapien.Scene`` of each env;
+    """Function ``build(scene, env)`` that adds actors and articulations to the ``sapien.Scene`` of each env;
     it needs ``engine="sapien"``.
     Visuals and lights are ignored, so code that was written for a screen runs unchanged. It may
     return the entities that :meth:`batchpid.sim.Runner.poses` reports. A reset returns the content

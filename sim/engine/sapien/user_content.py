@@ -1,4 +1,4 @@
-"""Scenes that need no render device, and the actors that the user's ``build`` function adds to
+"""Scenes that need no render device, and the content that the user's ``build`` function adds to
 them.
 """
 
@@ -11,12 +11,11 @@ import numpy as np
 import sapien
 from sapien.physx import (
     PhysxArticulation,
-    PhysxArticulationLinkComponent,
     PhysxCollisionShapeConvexMesh,
     PhysxCpuSystem,
-    PhysxRigidDynamicComponent,
 )
 from sapien.wrapper.actor_builder import ActorBuilder
+from sapien.wrapper.articulation_builder import ArticulationBuilder, LinkBuilder
 
 from batchpid.arrays.array_types import Float32
 from batchpid.errors import InvalidArgumentError
@@ -30,6 +29,20 @@ class _HeadlessBuilder(ActorBuilder):
     """Actor builder whose ``add_*_visual`` methods do nothing: a visual would need a render
     device.
     """
+
+
+class _HeadlessLink(_HeadlessBuilder, LinkBuilder):
+    """Builder of a link, likewise without visuals."""
+
+
+class _HeadlessArticulation(ArticulationBuilder):
+    """Builder of articulations whose links have no visuals."""
+
+    def create_link_builder(self, parent: LinkBuilder | None = None) -> LinkBuilder:
+        """Return a builder of a link that moves with ``parent``; None for the root."""
+        link = super().create_link_builder(parent)
+        self.link_builders[-1] = _HeadlessLink(link.index, parent)
+        return self.link_builders[-1]
 
 
 class HeadlessScene(sapien.Scene):
@@ -48,6 +61,10 @@ class HeadlessScene(sapien.Scene):
         """Return a builder of actors for this scene."""
         return _HeadlessBuilder().set_scene(self)
 
+    def create_articulation_builder(self) -> ArticulationBuilder:
+        """Return a builder of articulations for this scene."""
+        return _HeadlessArticulation().set_scene(self)
+
 
 for _name in dir(ActorBuilder):
     if _name.startswith("add_") and "visual" in _name:
@@ -60,23 +77,18 @@ for _name in dir(sapien.Scene):
 
 
 class SceneContent:
-    """Actors that ``build`` added to the scene of env ``env``; ``watched`` are the entities that it
-    returned.
+    """Actors and articulations that ``build`` added to the scene of env ``env``; ``watched`` are the
+    entities that it returned.
     """
 
     def __init__(self, build: Build, scene: HeadlessScene, env: int) -> None:
-        # What exists now is the robot and the ground; the rest is the user's.
-        before = {entity.per_scene_id for entity in scene.entities}
         self.watched = _call(build, scene, env)
-        added = [entity for entity in scene.entities if entity.per_scene_id not in before]
-        components = [component for entity in added for component in entity.components]
-        for component in components:
-            _check(component, env)
-        self._bodies = [
-            component
-            for component in components
-            if isinstance(component, PhysxRigidDynamicComponent)
-        ]
+        for entity in scene.entities:
+            for component in entity.components:
+                _check(component, env)
+        # In the order of their making: the first articulation is the robot.
+        self._bodies = scene.physx_system.rigid_dynamic_components
+        self._articulations = scene.get_all_articulations()[1:]
         self._start = self.read()
 
     def reset(self) -> None:
@@ -85,19 +97,36 @@ class SceneContent:
 
     def read(self) -> Float32:
         """Return the state of everything that moves (values,)."""
-        return np.ravel([read_body(body) for body in self._bodies]).astype(np.float32)
+        parts: list[Any] = [np.zeros(0), *map(read_body, self._bodies)]
+        for articulation in self._articulations:
+            parts += [
+                read_body(articulation.root),
+                articulation.qpos,
+                articulation.qvel,
+                articulation.qf,
+            ]
+        return np.concatenate(parts, dtype=np.float32)
 
     def write(self, state: Float32) -> None:
         """Put everything that moves into the state that :meth:`read` returned; further values are
         ignored.
         """
-        rows = state[: self._start.size].reshape(-1, ROOT_SIZE)
-        for body, row in zip(self._bodies, rows, strict=True):
+        values = iter(state)
+
+        def take(count: int) -> Float32:
+            return np.fromiter(values, np.float32, count)
+
+        for body in self._bodies:
+            row = take(ROOT_SIZE)
             body.set_entity_pose(sapien.Pose(row[:3], row[3:7]))
             # PhysX refuses velocities of kinematic bodies.
             if not body.kinematic:
                 body.set_linear_velocity(row[7:10])
                 body.set_angular_velocity(row[10:])
+        for articulation in self._articulations:
+            write_root(articulation, take(ROOT_SIZE))
+            for write in (articulation.set_qpos, articulation.set_qvel, articulation.set_qf):
+                write(take(articulation.dof))
 
     def poses(self) -> Float32:
         """Return the poses of the watched entities (watched, 7): x, y, z [m] and the quaternion w,
@@ -109,16 +138,11 @@ class SceneContent:
 
 
 def _check(component: Any, env: int) -> None:
-    """Raise InvalidArgumentError for a component that scenes do not take."""
-    name = component.entity.name
-    if isinstance(component, PhysxArticulationLinkComponent):
-        problem = f"added an articulation (link {name!r})"
-        remedy = "build actors: the runner's robot is the only articulation of a scene"
-        raise InvalidArgumentError("build", problem, env=env, remedy=remedy)
+    """Raise InvalidArgumentError for a component with a shape that ends the process."""
     for shape in getattr(component, "collision_shapes", ()):
-        # Two of them end the process once they touch.
+        # Two of them end it once they touch.
         if isinstance(shape, PhysxCollisionShapeConvexMesh) and min(shape.scale) < 0:
-            problem = f"gave {name!r} a convex mesh of negative scale"
+            problem = f"gave {component.entity.name!r} a convex mesh of negative scale"
             remedy = "mirror the vertices in the file"
             raise InvalidArgumentError("build", problem, env=env, remedy=remedy)
 
