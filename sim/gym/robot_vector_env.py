@@ -132,6 +132,8 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         if render_mode is not None:
             choice("render_mode", render_mode, self.metadata["render_modes"])
         # A step is a whole number of sim steps.
+        if "substeps" in options:
+            raise InvalidArgumentError("substeps", "follow from rate_hz", remedy="give rate_hz=")
         timestep = checked_option("timestep", options.get("timestep", RunnerOptions.timestep))
         rate = number("rate_hz", rate_hz, 1e-3, 1 / timestep, "actions per second")
         substeps = round(1 / (rate * timestep))

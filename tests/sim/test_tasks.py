@@ -111,6 +111,7 @@ def test_an_effort_is_zero_until_the_first_action(swings):
 @pytest.mark.parametrize(
     ("hook", "value"),
     [
+        ("command", np.zeros(3)),
         ("observe", np.zeros((3, 1))),
         ("observe", np.array([[0.0, 0], [0, np.nan], [0, 0]])),
         ("success", np.zeros((3, 1), bool)),
@@ -133,7 +134,6 @@ def test_a_wrong_result_of_a_hook_is_named(swings, hook, value):
 @pytest.mark.parametrize(
     ("hook", "value", "argument"),
     [
-        ("command", np.zeros(3), "setpoint"),
         ("rate", np.zeros(3), "setpoint_rate"),
         ("rate", np.full((3, 1), np.inf), "setpoint_rate"),
     ],

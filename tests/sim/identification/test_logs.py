@@ -57,6 +57,11 @@ def test_columns_are_found_by_name_in_the_order_of_the_robot(robot, tmp_path):
     assert (log.kind, log.measured) == ("effort", True)
 
 
+def test_a_quotation_mark_that_is_not_closed_ends_with_its_line(robot, tmp_path):
+    (log,) = read(robot, tmp_path, table(mode=["idle"] * 3 + ['"stop'] + ["idle"] * 196))
+    assert len(log.time) == len(TIME)
+
+
 def changed(name, row, value, kind="setpoint"):
     columns = {key: values.astype(object) for key, values in table(kind).items()}
     columns[name][row] = value

@@ -99,6 +99,9 @@ class Wave(Stage):
     name = "wave"
     after = "motors"
 
+    def init(self, values):
+        return values.model.load() * 0.0, values
+
     def step(self, state, values):
         qvel = values.measured.qvel
         xp = qvel.__array_namespace__()

@@ -135,6 +135,8 @@ def test_two_runs_may_have_other_lengths_but_not_other_joints():
     assert all(axes.get_xlim()[1] == pytest.approx(0.6) for axes in figure.axes)
     legend = [text.get_text() for text in figure.legends[0].get_texts()]
     assert {"run: each env", "run: median", "other: median"} <= {*legend}
+    legend = plots.step_responses(*runs).legends[0].get_texts()
+    assert "second: median" in [text.get_text() for text in legend]
     with pytest.raises(InvalidArgumentError, match="joint1"):
         plots.step_responses(make(1), make(2))
 

@@ -37,6 +37,18 @@ def test_limits_of_a_leader_are_narrowed_by_its_followers_through_chains(tmp_pat
         np.testing.assert_allclose(np.clip(poses, fingers.lower, fingers.upper), poses, atol=1e-6)
 
 
+def test_a_guard_holds_the_leader_of_a_follower_that_turns_without_end(tmp_path):
+    fingers = hand(tmp_path, a=limit(-1, 1), b=mimic("a", -2))
+    turning = Robot.load(
+        write(
+            tmp_path,
+            fingers.path.read_text().replace('"b" type="revolute"', '"b" type="continuous"'),
+        )
+    )
+    assert [joint.continuous for joint in turning.joints] == [False, True]
+    assert turning.guard().lower[0, 0] == -1
+
+
 def test_a_follower_that_leaves_no_range_does_not_narrow_it(tmp_path):
     fingers = hand(tmp_path, a=limit(-1, 1), b=limit(3, 4) + mimic("a"))
     np.testing.assert_array_equal(fingers.lower, [-1, -1])
