@@ -16,6 +16,7 @@ from batchpid.arrays.array_types import Document, Float64, Progress, Rows
 from batchpid.arrays.field_tables import Field
 from batchpid.checks import array
 from batchpid.errors import InvalidArgumentError
+from batchpid.io.files import imported
 from batchpid.sim import Robot, Rollout, write_recording
 from batchpid.sim.cli.flags import BOUNDS, Engine, Gains, NumEnvs, Randomize, Workers, flag
 from batchpid.sim.diagnosis.causes import (
@@ -196,7 +197,7 @@ def start_poses(robot: Robot, num_envs: int) -> Float64:
     Uniform within :data:`START_SPREAD`, and within a quarter of the joint's range where that is
     less. Row k is the same for any ``num_envs``.
     """
-    random = np.random.default_rng(0)
+    random = imported("numpy.random").default_rng(0)
     reach = np.minimum(START_SPREAD, (robot.upper - robot.lower) / 4)
     poses = robot.start + reach * random.uniform(-1.0, 1.0, (num_envs, robot.dof))
     poses[0] = robot.start
