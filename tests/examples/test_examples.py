@@ -250,7 +250,7 @@ NOTEBOOKS = sorted(EXAMPLES.glob("*.ipynb"))
 def shown(notebook):
     """Return the formats of all outputs of a notebook, in order."""
     return [
-        list(output.get("data", {}))
+        sorted(output.get("data", {}))
         for cell in notebook.cells
         for output in cell.get("outputs", [])
     ]
