@@ -48,7 +48,9 @@ def test_bundled_robots_keep_their_numbers(name, tmp_path):
     again = written_again(loaded, tmp_path)
     assert_same(again, loaded)
     poses = loaded.sample(3)
-    np.testing.assert_allclose(again.mass_matrix(poses), loaded.mass_matrix(poses), rtol=1e-12)
+    np.testing.assert_allclose(
+        again.mass_matrix(poses), loaded.mass_matrix(poses), rtol=1e-12, atol=1e-14
+    )
 
 
 @pytest.mark.parametrize("seed", range(4))
